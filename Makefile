@@ -16,7 +16,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	touch $@
 
 demo: install
-	$(BIN)/probmotion compare gait gait-monocular --quick --workers 2 --out demo --figures
+	@$(BIN)/probmotion compare gait gait-monocular --quick --draws 400 --workers 2 --out demo --report --figures
 
 test: install
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m 'not slow' -n 2 --dist worksteal tests

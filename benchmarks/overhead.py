@@ -51,7 +51,7 @@ def nuts_directly(posterior: MotionPosterior, warmup: int, draws: int) -> np.nda
             extra_fields=("potential_energy", "accept_prob", "diverging", "num_steps"),
         )
         theta = np.asarray(chain.get_samples())
-    posterior.complete(seeds.generator(SEED, "motions"), theta)
+    posterior.complete(theta, seeds.generator(SEED, "motions"))
     return theta
 
 
@@ -75,7 +75,7 @@ def ensemble_directly(posterior: MotionPosterior, warmup: int, draws: int, thin:
     sampler.reset()
     sampler.run_mcmc(state, draws // walkers, thin_by=thin)
     theta = sampler.get_chain(flat=True)
-    posterior.complete(seeds.generator(SEED, "motions"), theta)
+    posterior.complete(theta, seeds.generator(SEED, "motions"))
     return theta
 
 

@@ -104,7 +104,7 @@ def main() -> None:
     print(f"threads: {numba.get_num_threads()}")
     print(f"proposals_per_second: {draws.counts['density'] / draws.seconds:.0f}")
     print(f"draws_per_second: {CHAINS * DRAWS / draws.seconds:.0f}")
-    print(f"acceptance: {float(draws.dataset['acceptance'].mean()):.3f}")
+    print(f"acceptance: {float(draws.dataset['acceptance_rate'].mean()):.3f}")
     print(f"ess_per_second: {chain_diagnostics(draws)['ess_bulk'] / draws.seconds:.2f}")
     share = triangulation_share(given, draws.dataset["theta"].values[:, -1])
     print(f"triangulation_share: {share:.3f}")

@@ -115,7 +115,7 @@ print(f"{posterior.dim} dimensions; log density of the seed {posterior.log_seed:
 # %%
 sampler = MetropolisHastings(Isotropic(0.02), warmup=1500, thin=20)
 draws = sampler.sample(posterior, draws=150, chains=4, seed=0, progress=False)
-print(f"accepted: {float(draws.dataset['acceptance'].mean()):.2f}")
+print(f"accepted: {float(draws.dataset['acceptance_rate'].mean()):.2f}")
 
 drawn_poses = draws.flat()[:, 0]
 shown_poses = align_rigidly(drawn_poses[::100], np.broadcast_to(seed, (6, *seed.shape)))

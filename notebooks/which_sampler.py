@@ -1,6 +1,6 @@
 """Write the tables of "which sampler?" in the documentation and the README.
 
-probmotion compare all --quick --workers 2 --seeds 5 --out grid --report
+probmotion compare all --quick --draws 40 --workers 2 --seeds 5 --out grid --report
 python notebooks/which_sampler.py --grid grid    # store its measurements, then write the tables
 python notebooks/which_sampler.py                # write the tables from stored measurements
 """
@@ -42,7 +42,8 @@ def main() -> None:
     grid = parser.parse_args().grid
     if grid is not None:
         comparison = Comparison.load(grid)
-        command = f"probmotion compare all --quick --workers 2 --seeds {comparison.plan.seeds}"
+        options = f"--draws {comparison.plan.draws} --workers 2 --seeds {comparison.plan.seeds}"
+        command = f"probmotion compare all --quick {options}"
         save_measurements(comparison, command)
     advices = {name: advise(name) for name in dict.fromkeys(measured().rows["problem"])}
     tables = {
@@ -126,7 +127,7 @@ def result(advice: Advice, sampler: str) -> str:
     """Return a sampler's mean on a problem, or why it has none."""
     for each in (advice.recommended, *advice.tied, *advice.tied_with_warnings, *advice.worse):
         if each.sampler == sampler:
-            return f"{each.value:.3g}"
+            return f"{each.value:.2f}"
     return advice.without_draws[sampler]
 
 

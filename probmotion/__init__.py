@@ -15,7 +15,7 @@ _RENAMED = {
     "diffusion": "posteriors.noise_schedule", "draws": "posteriors.draws", "formats": "io",
     "cameras": "geometry.cameras", "kinematics": "motion.kinematics",
     "likelihoods": "posteriors.likelihoods", "noisy_joints": "posteriors.noisy_joints",
-    "pictures": "plots", "posterior": "posteriors.posterior", "priors": "posteriors.protocols",
+    "pictures": "plots", "resampling": "motion.resampling", "priors": "posteriors.protocols",
     "retargeting": "motion.retargeting", "rotations": "geometry.rotations",
     "sampling": "posteriors.sampling", "skeleton": "motion.skeleton",
 }  # fmt: skip

@@ -1,4 +1,12 @@
 from . import models as models, samplers as samplers
+from .calibration.grid import calibrate as calibrate
+from .comparison.functions import (
+    Score as Score,
+    posterior as posterior,
+    problem as problem,
+    sample as sample,
+    score as score,
+)
 from .comparison.grid import Comparison as Comparison, compare as compare
 from .geometry.cameras import Cameras as Cameras
 from .geometry.triangulation import triangulate as triangulate

@@ -1,14 +1,24 @@
-"""Validation of arguments."""
+"""Validation of arguments and of optional packages."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from difflib import get_close_matches
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 
 from probmotion.arrays import Array, array_namespace, to_numpy
 
-__all__ = ["check_count", "check_finite", "check_positive", "check_shape"]
+__all__ = [
+    "check_count",
+    "check_finite",
+    "check_positive",
+    "check_shape",
+    "did_you_mean",
+    "import_extra",
+]
 
 
 def check_shape(name: str, value: Array, expected: tuple[int | str, ...]) -> None:
@@ -27,6 +37,12 @@ def check_shape(name: str, value: Array, expected: tuple[int | str, ...]) -> Non
     ):
         sizes = ", ".join(map(str, expected))
         raise ValueError(f"{name} must have shape ({sizes}), got {shape}")
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return the end of an error message with the names similar to ``name``; empty without any."""
+    similar = " or ".join(get_close_matches(name, list(known)))
+    return f"; did you mean {similar}?" if similar else ""
 
 
 def check_finite(name: str, value: Any) -> None:
@@ -52,3 +68,21 @@ def check_count(name: str, value: int, least: int = 1) -> None:
     """Raise ``ValueError`` unless ``value`` is an integer of at least ``least``."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise ValueError(f"{name} must be an integer of at least {least}, got {value!r}")
+
+
+def import_extra(module: str, extra: str) -> Any:
+    """Import a module of the package that an extra of this package installs.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        If the package is missing; the message names the extra.
+    """
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            f"{module.partition('.')[0]} must be installed, got {error}; run pip install "
+            f"'probmotion[{extra}]'",
+            name=error.name,
+        ) from error

@@ -4,6 +4,13 @@ from .diffusion.mvpc import MultiViewPredictorCorrector as MultiViewPredictorCor
 from .diffusion.sds import ScoreDistillation as ScoreDistillation
 from .exact import ExactSampler as ExactSampler
 from .mcmc.ensemble import Ensemble as Ensemble
+from .mcmc.function import FunctionSampler as FunctionSampler
+from .mcmc.libraries import (
+    blackjax_kernel as blackjax_kernel,
+    emcee_sampler as emcee_sampler,
+    flowmc_sampler as flowmc_sampler,
+    numpyro_kernel as numpyro_kernel,
+)
 from .mcmc.metropolis import MetropolisHastings as MetropolisHastings
 from .mcmc.nuts import NUTS as NUTS
 from .variational.dvae import DVAEInference as DVAEInference

@@ -189,5 +189,5 @@ def motions(posterior: MotionPosterior, theta: np.ndarray, seed: int, first: int
         for numbers in batches(range(draws), 256):
             streams = NormalStreams.of_draws(seed, [(chain, first + draw) for draw in numbers])
             batch = slice(numbers[0], numbers[-1] + 1)
-            out[chain, batch] = posterior.complete(streams, theta[chain, batch])
+            out[chain, batch] = posterior.complete(theta[chain, batch], streams)
     return out

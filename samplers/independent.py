@@ -131,5 +131,6 @@ def _with_coordinates(
         result.dataset.assign(
             theta=(("chain", "draw", "coordinate"), theta.reshape(*shape, -1).swapaxes(0, 1)),
             log_density=(("chain", "draw"), log_density.reshape(shape).T),
-        )
+        ),
+        result.likelihood,
     )

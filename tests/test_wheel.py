@@ -51,7 +51,7 @@ def test_wheel_contains_every_module_and_nothing_else(wheel):
     }
     data = {
         "py.typed", "data/registry.csv", "plots/animation.css", "plots/animation.js",
-        "report/page.css", "report/tables.js", "comparison/measured.csv",
+        "report/copy.js", "report/page.css", "report/tables.js", "comparison/measured.csv",
         "comparison/measured.json",
     }  # fmt: skip
     data |= {

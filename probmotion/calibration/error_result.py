@@ -101,7 +101,7 @@ class ErrorDecomposition:
         return sentences
 
     def plot(self, path: str | Path) -> Path:
-        """Plot the parts, one panel per measure, to a ``.png`` file; return its path."""
+        """Plot the parts to a .png, .pdf or .svg file, one panel per measure; return its path."""
         from probmotion.plots.error_plots import draw_error_decomposition
 
         draw_error_decomposition(self.table(), path, words=MEASURES, notes=self.notes)

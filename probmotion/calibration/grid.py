@@ -25,7 +25,7 @@ from probmotion.comparison.results.naming import (
 )
 from probmotion.comparison.results.plan import Plan
 from probmotion.comparison.run.grid_runs import GridRun
-from probmotion.comparison.run.locks import locked
+from probmotion.comparison.run.locks import locked, plan_locked
 from probmotion.comparison.run.tasks import (
     Grid,
     check_grid_options,
@@ -69,7 +69,8 @@ def calibrate(
     Parameters
     ----------
     problems, samplers
-        As for :func:`~probmotion.comparison.compare`; problems must define ``simulate``.
+        As for :func:`~probmotion.comparison.compare`; problems must define ``simulate``,
+        posteriors must have a prior that can be sampled, and finished draws are not accepted.
     simulations : int
         Number of simulations per problem, at least 10.
     draws : int
@@ -98,6 +99,9 @@ def calibrate(
     check_grid_options(draws, chains, workers, budget, time_limit)
     chosen = named_problems(problems)
     used = named_samplers(samplers)
+    for name, sampler in used.items():
+        if getattr(sampler, "finished", False):
+            raise ValueError(f"samplers must sample every simulation, got finished draws, {name}")
     for name, source in chosen.items():
         problem = load_problem(source) if isinstance(source, str) else source
         if problem.simulate is None:
@@ -108,17 +112,18 @@ def calibrate(
     # Workers may have another working directory.
     parent = Path(tempfile.mkdtemp(prefix="probmotion-") if out is None else out).absolute()
     folder = writable_folder(parent / Calibration.FOLDER)
-    Plan.check_folder(folder)
     plan = Plan.of(chosen, used, draws, chains, simulations, budget, per="simulation")
+    plan.union(folder)  # raises before anything is written
     with locked(folder, chosen):
         grid = CalibrationGrid(folder, plan, chosen, used, budget, time_limit)
         refuse_other_settings(folder, [*grid.pilots(), *grid.runs()])
-        plan.save(folder)
+        with plan_locked(folder):
+            plan.union(folder).save(folder)
         run_grid(grid, workers, executor, progress, label="simulations")
-        # Concurrent runs of other problems in this folder may have overwritten the plan.
-        plan.save(folder)
-        calibration = Calibration(folder, plan, temporary=out is None)
-        calibration.write()
+        # Grids of other problems may have extended the plan.
+        with plan_locked(folder):
+            calibration = Calibration(folder, Plan.load(folder), temporary=out is None)
+            calibration.write()
     return calibration
 
 
@@ -128,13 +133,12 @@ class CalibrationRun(GridRun):
 
     stores_draws: ClassVar[bool] = False
 
-    def _measure(self, problem: Problem, progress: bool) -> tuple[MotionDraws, dict[str, float]]:
+    def _measure(self, problem: Problem) -> tuple[MotionDraws, dict[str, float], None]:
         assert problem.simulate is not None
         simulation = problem.simulate(self.seed)
         draws = self._draw(
             simulation.posterior,
             seeds.integer(self.seed, "calibration", self.problem, self.sampler),
-            progress,
         )
         ranks = ranks_of_truth(
             problem,
@@ -146,7 +150,7 @@ class CalibrationRun(GridRun):
         values: dict[str, float] = {}
         for name, rank in ranks.items():
             values |= {f"rank {name}": rank.value, f"draws {name}": float(rank.draws)}
-        return draws, values
+        return draws, values, None
 
 
 class CalibrationGrid(Grid):

@@ -184,7 +184,8 @@ class Calibration:
     def plot(self, path: str | Path | None = None, problem: str | None = None) -> Path:
         """Plot ranks and coverage of one or all problems, one block per sampler; return the path.
 
-        Raises ``ValueError`` if the problem is unknown or there are no ranks.
+        The path ends in .png, .pdf or .svg. Raises ``ValueError`` if the problem is unknown or
+        there are no ranks.
         """
         from probmotion.plots.ranks import draw_ranks
 

@@ -6,9 +6,9 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from tyro.conf import OmitArgPrefixes, Positional, arg
+from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
-from probmotion.cli.files import file_called
+from probmotion.cli.files import Conventions, file_called
 
 if TYPE_CHECKING:
     from probmotion.posteriors.problem import Problem
@@ -17,17 +17,17 @@ __all__ = ["Clips", "Compare"]
 
 
 @dataclass(frozen=True)
-class Clips:
+class Clips(Conventions):
     """User-supplied clips; one clip is held out and observed."""
 
-    clips: Annotated[tuple[str, ...], arg(metavar="FILE ...")] = ()
+    clips: Annotated[tuple[str, ...], arg(metavar="FILE ...", help_behavior_hint="")] = ()
     """Motion files (.npz, .bvh) or quoted patterns.
     The prior is fitted to all clips except the held-out one."""
 
     observe: str = "monocular"
     """Observations of the held-out clip: monocular, occluded, sparse or none."""
 
-    fps: float | None = None
+    fps: Annotated[float | None, arg(metavar="FPS", help_behavior_hint="")] = None
     """Frame rate to resample the clips to, frames per second; required if their rates differ."""
 
     frames: int = 30
@@ -42,28 +42,31 @@ class Clips:
     noise: float = 0.02
     """Standard deviation of the observed keypoints, metres."""
 
-    held_out: str | None = None
+    held_out: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """Name of the held-out clip (file name without extension); the last clip by default."""
 
 
 @dataclass(frozen=True)
 class Compare:
-    """Run samplers on the same posteriors and print their errors.
+    """Run samplers on the same posteriors and print which are right.
 
-    The folder --out stores every finished run (problem x sampler x seed). Run the same command
-    again to resume an interrupted comparison.
+    Finished runs are stored in --out: run the command again to resume it, with others to extend it.
+
+    Settings of samplers: --settings.SAMPLER.NAME VALUE; probmotion show SAMPLER lists them.
     """
 
-    problems: Annotated[Positional[tuple[str, ...]], arg(metavar="[PROBLEM ...]")] = ()
+    problems: Annotated[
+        Positional[tuple[str, ...]], arg(metavar="[PROBLEM ...]", help_behavior_hint="")
+    ] = ()
     """Names of problems (see probmotion list), or all for every problem with available data."""
 
-    samplers: Annotated[tuple[str, ...], arg(metavar="SAMPLER ...")] = ()
+    samplers: Annotated[tuple[str, ...], arg(metavar="SAMPLER ...", help_behavior_hint="")] = ()
     """Names of samplers or presets (see probmotion list); all samplers by default."""
 
-    draws: int | None = None
-    """Number of posterior draws per sampler; 200, or 40 with --quick."""
+    draws: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Number of posterior draws per sampler. Default: 200."""
 
-    chains: int | None = None
+    chains: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Number of chains; by default the largest divisor of the draws up to 4."""
 
     seeds: int = 1
@@ -73,32 +76,33 @@ class Compare:
     """Number of worker processes; 0 runs in this process. Draws do not depend on the number."""
 
     out: Path = Path("comparison")
-    """Output folder for table.csv and all draws."""
+    """Output folder for all draws and their metrics: table.txt, table.csv."""
 
-    quick: bool = False
-    """Quick run: 40 draws and 6 s per run, 60 s limit, reduced settings; other options override."""
+    quick: FlagCreatePairsOff[bool] = False
+    """Quick run: 6 s per run, 60 s limit, reduced settings; other options override."""
 
-    evaluations: int | None = None
+    evaluations: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Budget per run: evaluations of the density or denoiser; a gradient counts as two.
     Pilot runs choose matching settings. No budget by default."""
 
-    seconds: float | None = None
+    seconds: Annotated[float | None, arg(metavar="SECONDS", help_behavior_hint="")] = None
     """Budget per run, seconds on this machine. Default: none; 6 with --quick."""
 
-    time_limit: float | None = None
+    time_limit: Annotated[float | None, arg(metavar="SECONDS", help_behavior_hint="")] = None
     """Time limit per run, seconds; longer runs fail. Default: none; 60 with --quick."""
 
     calibrate: int = 0
     """Number of simulations for simulation-based calibration, at least 10; 0 for none.
     Each simulation costs as much as a run."""
 
-    report: bool = False
+    report: FlagCreatePairsOff[bool] = False
     """Also write report.html with the table, plots and animated draws."""
 
-    figures: bool = False
-    """Also write skeletons_PROBLEM.png and, where quality is measured, quality_against_cost.png."""
+    figures: FlagCreatePairsOff[bool] = False
+    """Also write figures, as .png and .pdf: skeletons_PROBLEM, spread_PROBLEM (of observed motion)
+    and, where quality is measured, quality_against_cost."""
 
-    prior: str | None = None
+    prior: Annotated[str | None, arg(metavar="FOLDER", help_behavior_hint="")] = None
     """Also sample a user-trained prior: the folder of a run of probmotion train diffusion or dvae.
     The prior is sampled without observations; errors require exact draws of the prior."""
 
@@ -115,15 +119,16 @@ class Compare:
         self._check_calibrate(problems)
         options = self._options()
         comparison = compare(problems, samplers, seeds=self.seeds, **options)
-        print(comparison.table())
-        print(f"\ntable and draws are in {self.out}")
+        print(comparison.summary())
+        print(f"\nmetrics: {self.out / 'table.txt'}, {self.out / 'table.csv'}")
         calibration = self._calibration(problems, samplers, options) if self.calibrate else None
         if self.report:
-            print(f"wrote {comparison.report(self.out / 'report.html', calibration)}")
+            print(f"report: {comparison.report(self.out / 'report.html', calibration)}")
         if self.figures:
             from probmotion.comparison.figures import draw_comparison
 
             draw_comparison(comparison, problems, self.out)
+            print(f"figures: {self.out / '*.pdf'}")
 
     def _options(self) -> dict[str, Any]:
         """Return the options shared by comparison and calibration."""
@@ -216,7 +221,8 @@ def _problem_of_clips(user_clips: Clips) -> Problem:
     from probmotion.problems.clips import clips_problem
 
     options = asdict(user_clips)
-    clips = load_all(options.pop("clips"))
+    conventions = {name: options.pop(name) for name in user_clips.conventions()}
+    clips = load_all(options.pop("clips"), **conventions)
     held_out = options.pop("held_out")
     return clips_problem(clips, held_out=-1 if held_out is None else held_out, **options)
 

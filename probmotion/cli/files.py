@@ -1,17 +1,17 @@
-"""The commands ``probmotion show`` and ``probmotion convert``."""
+"""The commands ``probmotion show``, ``report`` and ``convert``."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 if TYPE_CHECKING:
     from probmotion.motion.motion import Motion
 
-__all__ = ["Convert", "Show", "file_called"]
+__all__ = ["Conventions", "Convert", "Report", "Show", "file_called"]
 
 
 def file_called(path: Path) -> Path:
@@ -24,14 +24,36 @@ def file_called(path: Path) -> Path:
     return shipped if shipped.is_file() else path
 
 
+@dataclass(frozen=True, kw_only=True)
+class Conventions:
+    """Unit and axes of motion files."""
+
+    unit: Annotated[
+        Literal["m", "cm", "mm", "in"] | None, arg(metavar="UNIT", help_behavior_hint="")
+    ] = None
+    """Unit of .npz (default: m) and .bvh files (default: inferred): m, cm, mm or in."""
+
+    up: Annotated[Literal["y", "z"] | None, arg(metavar="AXIS", help_behavior_hint="")] = None
+    """Vertical axis of motion files, y or z; the declared one, or else y, by default."""
+
+    mirror: FlagCreatePairsOff[bool] = False
+    """Reflect x, for motion files in left-handed axes."""
+
+    def conventions(self) -> dict[str, Any]:
+        """Return the arguments of :func:`probmotion.load`."""
+        return {"unit": self.unit, "up": self.up, "mirror": self.mirror}
+
+
 @dataclass(frozen=True)
-class Show:
-    """Summarise a file of motion (.bvh, .npz), keypoints (.json, .npz, .csv), draws (.nc) or a
-    trained network (.safetensors).
+class Show(Conventions):
+    """Summarise a file, or a network, sampler or problem by name.
+
+    Files contain motion (.bvh, .npz), keypoints (.json, .npz, .csv), draws (.nc) or a network
+    (.safetensors). The summary of a sampler lists its settings.
     """
 
     file: Positional[Path]
-    """File, folder of a training run, or name of a shipped network."""
+    """File, folder of a training run, or name of a shipped network, sampler, preset or problem."""
 
     fps: float | None = None
     """Frame rate of keypoints in JSON or a table, frames per second."""
@@ -40,12 +62,20 @@ class Show:
     """Layout of JSON keypoints or joints to read from a table (see probmotion list)."""
 
     figure: Path | None = None
-    """Also write a figure of the motion, or of the first draws, to this .png file."""
+    """Also write a figure of the motion, or of the first draws, to this .png, .pdf or .svg file."""
 
     def run(self) -> None:
+        path = file_called(self.file)
+        if not path.exists():
+            from probmotion.cli.named_summaries import summarise_named
+
+            text = summarise_named(str(path))
+            if text is not None:
+                print(text)
+                return
         from probmotion.cli.summaries import summarise
 
-        summary = summarise(file_called(self.file), self.fps, self.skeleton)
+        summary = summarise(path, self.fps, self.skeleton, **self.conventions())
         print(summary.text)
         if self.figure is not None:
             summary.draw(self.figure)
@@ -53,7 +83,28 @@ class Show:
 
 
 @dataclass(frozen=True)
-class Convert:
+class Report:
+    """Write the report of a comparison again, from its folder; the comparison may be unfinished."""
+
+    folder: Positional[Path]
+    """Folder of the comparison, the --out of probmotion compare."""
+
+    out: Path | None = None
+    """HTML file to write; FOLDER/report.html by default."""
+
+    def run(self) -> None:
+        from probmotion.calibration.result import Calibration
+        from probmotion.comparison.grid import Comparison
+
+        comparison = Comparison.load(self.folder)
+        calibrated = any((self.folder / Calibration.FOLDER).glob("comparison.json"))
+        calibration = Calibration.load(self.folder) if calibrated else None
+        out = self.folder / "report.html" if self.out is None else self.out
+        print(f"report: {comparison.report(out, calibration)}")
+
+
+@dataclass(frozen=True)
+class Convert(Conventions):
     """Convert a motion to another format, frame rate or skeleton."""
 
     source: Annotated[Positional[Path], arg(name="IN")]
@@ -91,7 +142,7 @@ class Convert:
         if self.source.suffix != ".nc":
             if self.draw is not None:
                 raise ValueError(f"draw requires a file of draws (.nc), got {self.source}")
-            return load(self.source)
+            return load(self.source, **self.conventions())
         draws = MotionDraws.load(self.source)
         count = draws.dataset.sizes["draw"]
         draw = 0 if self.draw is None else self.draw

@@ -11,10 +11,11 @@ import sys
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, make_dataclass
+from importlib.metadata import version
 from typing import Any
 
 from probmotion.cli.compare import Compare
-from probmotion.cli.files import Convert, Show
+from probmotion.cli.files import Convert, Report, Show
 from probmotion.cli.reference import Reference
 from probmotion.cli.which import Which
 
@@ -26,14 +27,16 @@ Sample posteriors over 3D motion and measure the errors of samplers.
 
 commands:
   compare    run samplers on the same posteriors and measure their errors
+  report     write the report of a comparison again, from its folder
   which      recommend a sampler for a problem, from measurements
   list       list the named problems, samplers and skeletons
-  show       summarise a file of motion, keypoints, draws or a network
+  show       summarise a file, or a network, sampler or problem by name
   convert    convert a motion to another format, frame rate or skeleton
   train      train a prior, or a network for evaluating priors
   reference  generate certified reference draws of a problem
 
-probmotion COMMAND --help lists the options of a command."""
+probmotion COMMAND --help lists the options of a command.
+probmotion --version prints the version."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +80,8 @@ def _first_line(kind: Any) -> str:
 
 
 _COMMANDS: dict[str, type[Any]] = {
-    "compare": Compare, "which": Which, "list": List, "show": Show, "convert": Convert,
-    "reference": Reference,
+    "compare": Compare, "report": Report, "which": Which, "list": List, "show": Show,
+    "convert": Convert, "reference": Reference,
 }  # fmt: skip
 
 
@@ -88,6 +91,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not words or words[0] in ("-h", "--help"):
         print(_OVERVIEW)
         return 0 if words else 2
+    if words[0] == "--version":
+        print(f"probmotion {version('probmotion')}")
+        return 0
     commands = [*_COMMANDS, "train"]
     if words[0] not in commands:
         return _fail(f"command must be one of {', '.join(commands)}, got {words[0]!r}", 2)
@@ -108,7 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except OSError as error:
             named = error.filename and error.strerror
             return _fail(f"{error.filename}: {error.strerror}" if named else str(error), 2)
-        except ValueError as error:
+        except (ValueError, ModuleNotFoundError) as error:
             return _fail(str(error), 2)
         except MemoryError as error:
             return _fail(f"not enough memory: {error}", 2)
@@ -136,6 +142,9 @@ def _parse(name: str, words: Sequence[str]) -> Any:
     kind = _COMMANDS[name]
     if kind is not Compare:
         return tyro.cli(kind, prog=prog, args=words)
+    if not {"-h", "--help"}.isdisjoint(words):
+        # probmotion show lists the settings of samplers.
+        tyro.cli(Compare, prog=prog, args=["--help"])
     from probmotion.cli.settings_options import (
         objects_as_words,
         plain_docstrings,

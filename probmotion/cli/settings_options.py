@@ -29,16 +29,19 @@ if TYPE_CHECKING:
     from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 __all__ = [
+    "object_kinds",
     "objects_as_words",
+    "option_name",
     "plain_docstrings",
     "presets_of",
     "sampler_called",
     "settings_of_samplers",
+    "text_of_setting",
     "without_markup",
 ]
 
 
-def _option_name(sampler: str) -> str:
+def option_name(sampler: str) -> str:
     """Return the name of a sampler, converted to a Python identifier."""
     name = re.sub(r"\W", "_", sampler)
     return name if name.isidentifier() and not iskeyword(name) else f"sampler_{name}"
@@ -55,7 +58,7 @@ def settings_of_samplers(quick: bool = False) -> type[Any]:
     for name, kind in importable_samplers().items():
         default = partial(_same, reduced[name]) if quick else kind
         # If two names yield the same identifier, only the first sampler has options.
-        entries.setdefault(_option_name(name), (kind, field(default_factory=default)))
+        entries.setdefault(option_name(name), (kind, field(default_factory=default)))
     settings = make_dataclass(
         "Settings", [(name, *entry) for name, entry in entries.items()], frozen=True
     )
@@ -117,7 +120,7 @@ def sampler_called(name: str, settings: Any) -> Any:
     base, _, preset = (name, "", "") if name in sampler_names() else name.partition(".")
     kind = load_sampler(base)
     if not preset:
-        sampler = getattr(settings, _option_name(base), None)
+        sampler = getattr(settings, option_name(base), None)
         return sampler if type(sampler) is kind else default_sampler(base)
     known = presets_of(kind)
     if preset not in known:
@@ -138,7 +141,7 @@ def objects_as_words() -> ConstructorRegistry:
 def _rule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
     from tyro.constructors import PrimitiveConstructorSpec
 
-    kinds = _kinds(info.type)
+    kinds = object_kinds(info.type)
     if not kinds:
         return None
     return PrimitiveConstructorSpec(
@@ -150,7 +153,7 @@ def _rule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
     )
 
 
-def _kinds(annotation: Any) -> list[type]:
+def object_kinds(annotation: Any) -> list[type]:
     """Return the dataclasses that an annotation allows: those of a union or a protocol."""
     if isinstance(annotation, types.UnionType) or getattr(annotation, "__origin__", None) is Union:
         kinds = list(get_args(annotation))
@@ -205,7 +208,7 @@ def _build(tree: ast.expr, known: dict[str, type]) -> Any:
 def text_of_object(value: Any) -> str:
     """Return ``value`` as text for :func:`object_from_text`, without default settings."""
     changed = [
-        f"{entry.name}={_text(getattr(value, entry.name))}"
+        f"{entry.name}={text_of_setting(getattr(value, entry.name))}"
         for entry in fields(value)
         if entry.init and getattr(value, entry.name) != entry.default
     ]
@@ -213,5 +216,6 @@ def text_of_object(value: Any) -> str:
     return f"{name}({', '.join(changed)})" if changed else name
 
 
-def _text(value: Any) -> str:
+def text_of_setting(value: Any) -> str:
+    """Return ``value`` as text for the command line."""
     return text_of_object(value) if is_dataclass(value) else repr(value)

@@ -46,10 +46,13 @@ class Summary:
         )
 
 
-def summarise(path: Path, fps: float | None = None, skeleton: str | None = None) -> Summary:
+def summarise(
+    path: Path, fps: float | None = None, skeleton: str | None = None, **conventions: Any
+) -> Summary:
     """Return a summary of a file of motion, keypoints or draws, or of a trained network.
 
-    ``fps`` and ``skeleton`` are the frame rate and layout of keypoints in JSON or a table.
+    ``fps`` and ``skeleton`` are the frame rate and layout of keypoints in JSON or a table,
+    ``conventions`` the arguments of :func:`~probmotion.load`.
 
     Raises
     ------
@@ -70,7 +73,7 @@ def summarise(path: Path, fps: float | None = None, skeleton: str | None = None)
         return _track_summary(path, read_keypoints(path, fps, skeleton))
     from probmotion.io.files import load
 
-    return _motion_summary(path, load(path))
+    return _motion_summary(path, load(path, **conventions))
 
 
 def kind_of_network(path: Path) -> str:

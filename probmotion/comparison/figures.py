@@ -1,10 +1,10 @@
-"""Figures of a comparison: quality against cost, and skeletons of every sampler's draws."""
+"""Figures of a comparison: quality against cost, skeletons of draws, and their spread."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,8 +13,12 @@ from probmotion.interaction.geometry.coordinates import align_rigidly
 from probmotion.plots.pairs import draw_pairs
 from probmotion.plots.quality import plot_quality_against_cost
 from probmotion.plots.skeletons import draw_skeletons
+from probmotion.plots.spread import plot_spread
+from probmotion.plots.style import finish_figure
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from probmotion.comparison.results.grid_results import GridResults
     from probmotion.motion.skeleton import Skeleton
     from probmotion.posteriors.problem import Problem
@@ -23,6 +27,7 @@ __all__ = ["draw_comparison"]
 
 _DRAWS = 4  # draws per sampler
 _POSES = 6  # poses per sampler of problems with held-out poses
+_REFERENCES = 100  # reference draws of the spread
 _SIDE_VIEW = np.pi / 2 - 0.35
 """Heading of bodies without observations, radians."""
 
@@ -30,10 +35,12 @@ _SIDE_VIEW = np.pi / 2 - 0.35
 def draw_comparison(
     comparison: GridResults, problems: Iterable[Problem], folder: str | Path
 ) -> list[Path]:
-    """Write ``quality_against_cost.png`` and ``skeletons_<problem>.png``; return their paths.
+    """Write the figures of a comparison, each as PNG and PDF, and return their paths.
 
-    The quality plot is omitted if no headline metric was measured. With observations, motions are
-    viewed at a right angle to the first camera, if any, with the truth in grey.
+    The figures are ``quality_against_cost``, ``skeletons_<problem>`` and, for problems with
+    observations, ``spread_<problem>``. The quality plot is omitted if no headline metric was
+    measured. With observations, motions are viewed at a right angle to the first camera, if any,
+    with the truth in grey.
 
     Parameters
     ----------
@@ -49,57 +56,60 @@ def draw_comparison(
     ValueError
         If a problem has neither draws nor references.
     """
-    folder = Path(folder)
-    written = []
+    figures: dict[str, Figure] = {}
     table = comparison.table()
     if headline_metric(table):
-        written.append(folder / "quality_against_cost.png")
-        plot_quality_against_cost(table, written[0])
+        figures["quality_against_cost"] = plot_quality_against_cost(
+            table, verdicts=comparison.verdicts()
+        )
     for problem in problems:
-        written.append(folder / f"skeletons_{problem.name}.png")
-        _draw_problem(comparison, problem, written[-1])
-    return written
+        figures |= _draw_problem(comparison, problem)
+    paths = [Path(folder) / f"{name}{suffix}" for name in figures for suffix in (".png", ".pdf")]
+    for path in paths:
+        finish_figure(figures[path.stem], path)
+    return paths
 
 
-def _draw_problem(comparison: GridResults, problem: Problem, path: Path) -> None:
-    """Write each sampler's draws of a problem below exact or reference draws."""
-    drawn = {}
-    shown = _DRAWS if problem.held_out is None else _POSES
-    for result in comparison.results:
-        if result.problem == problem.name and result.seed == 0 and result.failure is None:
-            motions = comparison.draws(problem.name, result.sampler).flat()
-            # Choose evenly spaced draws, because consecutive draws of a chain are similar.
-            drawn[result.sampler] = motions[:: max(1, len(motions) // shown)]
-    rows = {}
-    if "exact" in drawn:
-        rows["exact"] = drawn.pop("exact")
+def _draw_problem(comparison: GridResults, problem: Problem) -> dict[str, Figure]:
+    """Return figures of each sampler's draws of a problem below exact or reference draws."""
+    draws = {
+        result.sampler: comparison.draws(problem.name, result.sampler).flat()
+        for result in comparison.results
+        if result.problem == problem.name and result.seed == 0 and result.failure is None
+    }
+    if "exact" in draws:
+        draws = {"exact": draws.pop("exact")} | draws
     elif problem.has_reference:
         label = "reference" if problem.exact_source is None else "exact draws"
-        rows[label] = problem.reference(0, shown)
-    rows |= drawn
-    if not rows:
+        n = _REFERENCES if problem.stored is None else min(_REFERENCES, problem.stored.n)
+        draws = {label: problem.reference(0, n)} | draws
+    if not draws:
         raise ValueError(f"problem must have draws or references, got none for {problem.name!r}")
+    shown = _DRAWS if problem.held_out is None else _POSES
+    # Choose evenly spaced draws, because consecutive draws of a chain are similar.
+    rows = {label: motions[:: max(1, len(motions) // shown)] for label, motions in draws.items()}
+    name = f"skeletons_{problem.name}"
     skeleton, likelihood = problem.posterior.skeleton, problem.posterior.likelihood
     if problem.held_out is not None:
-        _draw_poses({"held out": problem.held_out} | rows, skeleton, path, problem.name)
-        return
+        return {name: _draw_poses({"held out": problem.held_out} | rows, skeleton, problem.name)}
     if likelihood is None:
         heading = _SIDE_VIEW if skeleton.mirrored_pairs else None
-        draw_skeletons(rows, skeleton, path, heading=heading, title=problem.name)
-        return
+        return {name: draw_skeletons(rows, skeleton, heading=heading, title=problem.name)}
     cameras = getattr(likelihood, "cameras", None)
-    draw_skeletons(
-        rows,
-        skeleton,
-        path,
-        azimuth=0.0 if cameras is None else float(cameras.azimuth[0]) + np.pi / 2,
-        truth=problem.truth,
-        title=problem.name + ("" if cameras is None else ", viewed at 90° to the camera"),
-    )
+    view: dict[str, Any] = {
+        "azimuth": 0.0 if cameras is None else float(cameras.azimuth[0]) + np.pi / 2,
+        "truth": problem.truth,
+        "title": problem.name + ("" if cameras is None else ", viewed at 90° to the camera"),
+    }
+    figures = {name: draw_skeletons(rows, skeleton, **view)}
+    several = {label: motions for label, motions in draws.items() if len(motions) > 1}
+    if several:
+        figures[f"spread_{problem.name}"] = plot_spread(several, skeleton, **view)
+    return figures
 
 
-def _draw_poses(rows: dict[str, np.ndarray], skeleton: Skeleton, path: Path, title: str) -> None:
-    """Write evenly spaced poses of each row, (n, 1, J, 3), aligned with the first pose."""
+def _draw_poses(rows: dict[str, np.ndarray], skeleton: Skeleton, title: str) -> Figure:
+    """Return a figure of evenly spaced poses of each row, (n, 1, J, 3), aligned with the first."""
     chosen = {
         label: motions[:: max(1, len(motions) // _POSES), 0][:_POSES]
         for label, motions in rows.items()
@@ -109,4 +119,4 @@ def _draw_poses(rows: dict[str, np.ndarray], skeleton: Skeleton, path: Path, tit
         label: align_rigidly(poses, np.broadcast_to(first, poses.shape))
         for label, poses in chosen.items()
     }
-    draw_pairs(chosen, skeleton, path, columns=_POSES, azimuth=0.6, elevation=0.2, title=title)
+    return draw_pairs(chosen, skeleton, columns=_POSES, azimuth=0.6, elevation=0.2, title=title)

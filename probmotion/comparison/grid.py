@@ -19,7 +19,7 @@ from probmotion.comparison.results.naming import (
 )
 from probmotion.comparison.results.plan import Plan
 from probmotion.comparison.results.stored_problems import store_problem
-from probmotion.comparison.run.locks import locked
+from probmotion.comparison.run.locks import locked, plan_locked
 from probmotion.comparison.run.tasks import (
     Grid,
     check_grid_options,
@@ -44,9 +44,12 @@ class Comparison(GridResults):
     """
 
     def plot(self, path: str | Path | None = None) -> Path:
-        """Plot quality against cost and return the path, by default in the folder of the grid."""
+        """Plot quality against cost and return the path, by default in the folder of the grid.
+
+        ``path`` ends in .png, .pdf or .svg. Markers of samplers that are right are filled.
+        """
         target = self.folder / _FIGURE if path is None else Path(path)
-        plot_quality_against_cost(self.table(), target)
+        plot_quality_against_cost(self.table(), target, verdicts=self.verdicts())
         return target
 
     def report(self, path: str | Path, calibration: Calibration | None = None) -> Path:
@@ -72,7 +75,8 @@ def compare(
 
     The random numbers of a run depend only on its problem, sampler and seed, so the results do not
     depend on ``workers`` or ``executor``. Each run is stored as soon as it is finished; repeat
-    the call to resume an interrupted grid.
+    the call to resume an interrupted grid. Other problems, samplers and seeds extend a grid in
+    ``out``; the result contains all of them.
 
     Parameters
     ----------
@@ -107,8 +111,8 @@ def compare(
     ------
     ValueError
         If a problem or sampler is unknown, names are not unique, a number is out of range,
-        ``out`` contains runs made with other settings or by another version, or another process is
-        running one of the problems in ``out``.
+        ``out`` contains runs made with other draws, chains, budget, settings or versions, or
+        another process is running one of the problems in ``out``.
     OSError
         If ``out`` cannot be written to; finished runs remain stored.
     KeyboardInterrupt
@@ -124,8 +128,8 @@ def compare(
     given = Path(tempfile.mkdtemp(prefix="probmotion-") if out is None else out)
     # Workers may have another working directory.
     folder = writable_folder(given).absolute()
-    Plan.check_folder(folder)
     plan = Plan.of(chosen, used, draws, chains, seeds, budget)
+    plan.union(folder)  # raises before anything is written
     with locked(folder, chosen):
         grid = Grid(folder, plan, chosen, used, budget, time_limit)
         refuse_other_settings(folder, [*grid.pilots(), *grid.runs()])
@@ -139,10 +143,11 @@ def compare(
                 # If reference draws failed, every run of the problem records the same error.
                 if isinstance(error, OSError):
                     raise
-        plan.save(folder)
+        with plan_locked(folder):
+            plan.union(folder).save(folder)
         run_grid(grid, workers, executor, progress)
-        # A grid of other problems in the same folder may have overwritten the plan.
-        plan.save(folder)
-        comparison = Comparison(folder, plan, temporary=out is None)
-        comparison.write(folder)
+        # Grids of other problems may have extended the plan.
+        with plan_locked(folder):
+            comparison = Comparison(folder, Plan.load(folder), temporary=out is None)
+            comparison.write(folder)
     return comparison

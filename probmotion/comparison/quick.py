@@ -1,4 +1,4 @@
-"""Settings of quick runs: few draws, a small budget and cheaper samplers."""
+"""Settings of quick runs: a small budget and cheaper samplers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ QUICK: Mapping[str, Mapping[str, Any]] = {
 }
 """Reduced settings by sampler; other settings have their defaults."""
 
-QUICK_DRAWS = 40
+QUICK_DRAWS = 200
 """Number of draws per run."""
 
 QUICK_BUDGET = Budget(seconds=6.0)

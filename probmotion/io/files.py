@@ -10,17 +10,33 @@ from pathlib import Path
 from probmotion.io.amc import read_amc
 from probmotion.io.bvh import read_bvh
 from probmotion.io.bvh_writing import write_bvh
+from probmotion.io.conventions import (
+    UNITS,
+    check_sides,
+    check_size,
+    check_up,
+    in_metres,
+    reflected,
+    y_up,
+)
 from probmotion.io.deeplabcut import read_deeplabcut
 from probmotion.io.errors import MotionFileError, MotionFileWarning
 from probmotion.io.keypoint_json import read_keypoint_json
-from probmotion.io.npz import read_keypoint_npz, read_npz, write_npz
+from probmotion.io.npz import Archive, read_keypoint_npz, read_npz, write_npz
 from probmotion.motion.motion import KeypointTrack, Motion
 from probmotion.motion.skeleton import Skeleton
 
 __all__ = ["files_named", "load", "load_all", "read_keypoints", "save"]
 
 
-def load(path: str | Path, fps: float | None = None) -> Motion:
+def load(
+    path: str | Path,
+    fps: float | None = None,
+    *,
+    unit: str | None = None,
+    up: str | None = None,
+    mirror: bool = False,
+) -> Motion:
     """Read a motion from a ``.bvh``, ``.npz`` or ``.amc`` file.
 
     Parameters
@@ -29,6 +45,13 @@ def load(path: str | Path, fps: float | None = None) -> Motion:
         Motion file; an ``.amc`` file requires its ``.asf`` skeleton in the same folder.
     fps : float, optional
         Frames per second to resample to; the file's rate by default.
+    unit : str, optional
+        Unit of lengths in a ``.bvh`` or ``.npz`` file, ``m``, ``cm``, ``mm`` or ``in``. By default,
+        that of a ``.bvh`` file is inferred, and an ``.npz`` file is in metres.
+    up : str, optional
+        Vertical axis of the file, ``y`` or ``z``; by default the one declared, or else ``y``.
+    mirror : bool
+        Reflect x, for files in left-handed axes.
 
     Returns
     -------
@@ -38,33 +61,58 @@ def load(path: str | Path, fps: float | None = None) -> Motion:
     Raises
     ------
     MotionFileError
-        If the file contains no motion or is damaged.
+        If the file contains no motion or is damaged; if bodies are not 0.3 to 3 m large, unless
+        ``unit`` is given; or if they stand along Z, unless ``up`` is given or declared.
     FileNotFoundError
         If the file does not exist.
+    ValueError
+        If ``unit`` or ``up`` is unknown, or ``unit`` is given for an ``.amc`` file.
 
     Warns
     -----
     MotionFileWarning
-        If a unit or frame rate is assumed or joints are dropped; see :func:`read_bvh`,
-        :func:`read_amc` and :func:`~probmotion.io.npz.read_npz`.
+        If a unit or frame rate is assumed, joints are dropped, or left joints are on the body's
+        right; see :func:`read_bvh`, :func:`read_amc` and :func:`~probmotion.io.npz.read_npz`.
     """
     path = Path(path)
-    readers = {".bvh": read_bvh, ".npz": read_npz, ".amc": read_amc}
-    if path.suffix.lower() not in readers:
-        if not path.exists():
-            raise FileNotFoundError(f"path must be an existing file, got {path}")
-        raise MotionFileError(
-            f"{path}: expected .bvh, .npz or .amc, got {path.suffix!r}; use "
-            "read_keypoints for 2D keypoints"
-        )
-    motion = readers[path.suffix.lower()](path)
-    if path.suffix.lower() == ".amc":
+    for name, value, known in (("unit", unit, [*UNITS]), ("up", up, ["y", "z"])):
+        if value is not None and value not in known:
+            raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
+    suffix, declared = path.suffix.lower(), False
+    if suffix == ".npz":
+        motion = read_npz(path, up)
+        declared = "up_axis" in Archive(path).keys
+        if unit is not None:
+            motion = in_metres(motion, unit)
+    elif suffix == ".bvh":
+        motion = read_bvh(path, None if unit is None else UNITS[unit])
+    elif suffix == ".amc":
+        if unit is not None:
+            raise ValueError(f"unit must be None for {path}, whose .asf file has one, got {unit!r}")
+        motion = read_amc(path)
         warnings.warn(
             f"{path}: assuming {motion.fps:g} frames per second, as in most of the CMU database; "
             "set it with read_amc(path, fps=…)",
             MotionFileWarning,
             stacklevel=2,
         )
+    elif not path.exists():
+        raise FileNotFoundError(f"path must be an existing file, got {path}")
+    else:
+        raise MotionFileError(
+            f"{path}: suffix must be .bvh, .npz or .amc, got {path.suffix!r}; use "
+            "read_keypoints for 2D keypoints"
+        )
+    if unit is None:
+        check_size(motion, path)
+    if up is None and not declared:
+        check_up(motion, path)
+    if up == "z" and suffix != ".npz":
+        motion = y_up(motion)
+    if mirror:
+        motion = reflected(motion)
+    else:
+        check_sides(motion, path)
     return motion if fps is None else motion.resample(fps)
 
 
@@ -135,7 +183,12 @@ def read_keypoints(
 
 
 def load_all(
-    paths: str | Path | Iterable[str | Path], fps: float | None = None
+    paths: str | Path | Iterable[str | Path],
+    fps: float | None = None,
+    *,
+    unit: str | None = None,
+    up: str | None = None,
+    mirror: bool = False,
 ) -> Sequence[Motion]:
     """Read all motions of ``paths``, sorted by path.
 
@@ -145,13 +198,16 @@ def load_all(
         Files, or patterns such as ``"walks/*.bvh"``.
     fps : float, optional
         Frames per second to resample to; the rate of each file by default.
+    unit, up, mirror
+        As for :func:`load`.
 
     Raises
     ------
     FileNotFoundError
         If a pattern matches no file or a file does not exist.
     """
-    return [load(path, fps) for path in files_named(paths)]
+    files = files_named(paths)
+    return [load(file, fps, unit=unit, up=up, mirror=mirror) for file in files]
 
 
 def files_named(paths: str | Path | Iterable[str | Path]) -> list[Path]:

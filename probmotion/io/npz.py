@@ -32,6 +32,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from probmotion.files import written_whole
+from probmotion.io.conventions import Z_UP_TO_Y_UP, y_up
 from probmotion.io.errors import (
     LARGEST,
     MotionFileError,
@@ -46,16 +47,13 @@ from probmotion.validation import check_shape
 
 __all__ = ["Archive", "read_keypoint_npz", "read_npz", "write_npz"]
 
-# Rotation from Z up to Y up: (x, y, z) → (x, z, -y).
-_Z_UP_TO_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
-
-def read_npz(path: str | Path) -> Motion:
+def read_npz(path: str | Path, up: str | None = None) -> Motion:
     """Read a motion from an ``.npz`` archive.
 
     Several people form one skeleton, with one root per person and joints named ``person:joint``.
-    Z-up positions are rotated to Y up about the x axis. Joints without a position in any frame are
-    dropped with a :class:`MotionFileWarning`.
+    Z-up positions are rotated to Y up about the x axis; ``up`` overrides ``up_axis``. Joints
+    without a position in any frame are dropped with a :class:`MotionFileWarning`.
 
     Raises
     ------
@@ -68,21 +66,22 @@ def read_npz(path: str | Path) -> Motion:
     positions = archive.points("positions", "(L, J, 3) or (L, P, J, 3)")
     skeleton = archive.skeleton(positions.shape[-2])
     fps = archive.frame_rate()
-    turn = archive.turn_to_y_up()
+    turn = archive.turn_to_y_up(up)
     with errors_in(archive.path):
         if positions.ndim == 4:
             skeleton = _crowd(skeleton, archive.names("persons", "person", positions.shape[1]))
             positions = positions.reshape(len(positions), -1, 3)
         positions, skeleton = _without_unseen(positions, skeleton, archive.path)
         rotations, rest_offsets = archive.kinematics(*positions.shape[:2])
-        return Motion(
-            positions if turn is None else positions @ turn.T,
+        motion = Motion(
+            positions,
             skeleton,
             fps,
             rotations=rotations,
             rest_offsets=rest_offsets,
             name=archive.word("name", archive.path.stem),
         )
+        return motion if turn is None else y_up(motion)
 
 
 def write_npz(motion: Motion, path: str | Path) -> None:
@@ -211,14 +210,15 @@ class Archive:
         with errors_in(self.path):
             return Skeleton(names, [int(parent) for parent in parents], radii)
 
-    def turn_to_y_up(self) -> np.ndarray | None:
-        """Return the rotation from the file's axes to Y up; None for the identity."""
-        up = self.word("up_axis", "y").lower()
+    def turn_to_y_up(self, up: str | None = None) -> np.ndarray | None:
+        """Return the rotation from the file's axes to Y up; None for the identity.
+
+        ``up`` overrides the file's ``up_axis``.
+        """
+        up = self.word("up_axis", "y").lower() if up is None else up
         if up not in ("y", "z"):
             self.fail(f"up_axis must be 'y' or 'z', got {shortened(up)}")
-        if up == "z" and "rotations" in self.keys:
-            self.fail("up_axis must be 'y' in a file with rotations, got 'z'")
-        return _Z_UP_TO_Y_UP if up == "z" else None
+        return Z_UP_TO_Y_UP if up == "z" else None
 
     def kinematics(self, frames: int, n_joints: int) -> tuple[np.ndarray | None, np.ndarray | None]:
         """Return rotations and rest offsets; both are None if the file has no rotations."""

@@ -36,3 +36,4 @@ from .two_sample import (
     maximum_mean_discrepancy as maximum_mean_discrepancy,
 )
 from .uniformity import ecdf_band as ecdf_band, uniformity_p_value as uniformity_p_value
+from .verdict import Verdict as Verdict, draw_statistics as draw_statistics, judge as judge

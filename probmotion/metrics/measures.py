@@ -15,6 +15,7 @@ from probmotion.interaction.geometry.coordinates import align_motions
 from probmotion.metrics import accuracy, distribution, keypoints
 from probmotion.metrics.chains import chain_diagnostics
 from probmotion.metrics.generation import GenerationReference, diversity
+from probmotion.metrics.reference_draws import reference_draws
 from probmotion.metrics.stein import NoGradient, kernel_stein_discrepancy, score_of
 from probmotion.metrics.two_sample import classifier_two_sample, maximum_mean_discrepancy
 from probmotion.posteriors.draws import MotionDraws
@@ -128,7 +129,7 @@ class _Exact:
 def _exact_draws(problem: Problem, seed: int, n: int) -> _Exact:
     limit = problem.max_references
     n_sets = min(_MAX_SETS, max(2, _EXACT_DRAWS // n), *([] if limit is None else [limit // n]))
-    reference = problem.reference(seed, n_sets * n)
+    reference = reference_draws(problem, seed, n_sets * n)[: n_sets * n]
     flat = _compared(problem, reference)
     rng = seeds.generator(seed, "directions")
     prior = problem.posterior.prior

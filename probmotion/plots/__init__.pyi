@@ -11,3 +11,5 @@ from .pairs import draw_pairs as draw_pairs
 from .quality import plot_quality_against_cost as plot_quality_against_cost
 from .ranks import draw_ranks as draw_ranks
 from .skeletons import draw_skeletons as draw_skeletons
+from .spread import joint_sd as joint_sd, plot_spread as plot_spread
+from .style import SamplerStyle as SamplerStyle, sampler_style as sampler_style

@@ -14,7 +14,7 @@
   let drawn = 0; // time of the last drawn frame, milliseconds
   let waiting = 0; // id of the requested animation frame
   let pointer = null; // last position of the dragging pointer
-  let colours = {};
+  const colours = {};
 
   const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)).buffer;
   const motion = ({ unit, numbers }) => ({ unit: unit / 1000, numbers: new Int16Array(bytes(numbers)) });
@@ -26,23 +26,25 @@
       truth: data.truth && motion(data.truth),
       keypoints: floats(data.keypoints),
       dots: floats(data.dots),
+      sds: data.sds.map((sd) => sd && new Int16Array(bytes(sd))),
     });
 
+  const COLOURS = ["ink", "paper", "left", "right", "ghost", "ground", "shadow", "seen"];
   const readColours = () => {
     const style = getComputedStyle(element);
-    for (const name of ["ink", "left", "right", "ghost", "rule", "seen", "paper"]) {
+    for (const name of [...COLOURS, "certain", "between", "uncertain"]) {
       colours[name] = style.getPropertyValue(`--${name}`).trim();
     }
   };
 
-  // Metres across and down from the centre, and nearness, for an orthographic camera as in
+  // Metres across and down from the centre, closeness and size, for an orthographic camera as in
   // Cameras.around or for the camera of the observations.
   const turned = () => {
     const [ca, sa] = [Math.cos(view.azimuth), Math.sin(view.azimuth)];
     const [ce, se] = [Math.cos(view.elevation), Math.sin(view.elevation)];
     return (x, y, z) => {
       const towards = sa * x + ca * z;
-      return [ca * x - sa * z, se * towards - ce * (y - data.middle), ce * towards + se * y];
+      return [ca * x - sa * z, se * towards - ce * (y - data.middle), ce * towards + se * y, 1];
     };
   };
   const filmed = (frame) => {
@@ -60,19 +62,13 @@
     return {
       body: (x, y, z) => {
         const [across, down, far] = shown(x + ax, y, z + az);
-        return [metres * (across - u), metres * (down - v), -far];
+        const size = perspective ? depth / far : 1;
+        return [metres * (across - u), metres * (down - v), -far, size];
       },
       keypoint: (across, down) => [metres * (across - u), metres * (down - v)],
     };
   };
 
-  const path = (pen, points, colour, width) => {
-    pen.beginPath();
-    points.forEach(([x, y]) => pen.lineTo(x, y));
-    pen.strokeStyle = colour;
-    pen.lineWidth = width;
-    pen.stroke();
-  };
   const jointsOf = ({ unit, numbers }, frame, see) => {
     const joints = [];
     for (let at = 3 * data.joints * frame; joints.length < data.joints; at += 3) {
@@ -80,46 +76,137 @@
     }
     return joints;
   };
-  const dot = (pen, [x, y], size) => {
+  const headOf = (joints) => {
+    const mean = (axis) =>
+      data.head.reduce((sum, joint) => sum + joints[joint][axis], 0) / data.head.length;
+    return [0, 1, 2, 3].map(mean);
+  };
+  const circle = (pen, [x, y], radius) => {
     pen.beginPath();
-    pen.arc(x, y, size, 0, 2 * Math.PI);
+    pen.arc(x, y, radius, 0, 2 * Math.PI);
+  };
+  // A body in a single colour: the truth, other draws and shadows.
+  const silhouette = (pen, joints, colour, opacity, thickness) => {
+    pen.globalAlpha = opacity;
+    pen.strokeStyle = pen.fillStyle = colour;
+    pen.lineWidth = thickness * data.thickness * joints[0][3];
+    // A single path, because overlapping translucent strokes would be darker.
+    pen.beginPath();
+    data.bones.forEach(([a, b]) => {
+      pen.moveTo(joints[a][0], joints[a][1]);
+      pen.lineTo(joints[b][0], joints[b][1]);
+    });
+    pen.stroke();
+    if (data.head.length) {
+      const head = headOf(joints);
+      circle(pen, head, thickness * data.headRadius * head[3]);
+      pen.fill();
+    }
+    pen.globalAlpha = 1;
+  };
+  // A body of capsules, near ones in front of far ones.
+  const body = (pen, joints, colourOf) => {
+    const inHead = (joint) => data.head.includes(joint);
+    const parts = data.bones
+      .filter(([a, b]) => !(inHead(a) && inHead(b)))
+      .map((bone) => [joints[bone[0]][2] + joints[bone[1]][2], bone]);
+    const head = data.head.length ? headOf(joints) : null;
+    if (head) parts.push([2 * head[2] + data.headRadius, null]);
+    parts.sort(([one], [other]) => one - other);
+    parts.forEach(([, bone]) => {
+      if (bone) {
+        const [a, b] = [joints[bone[0]], joints[bone[1]]];
+        const width = 0.5 * data.thickness * (a[3] + b[3]);
+        for (const [colour, wide] of [[colours.paper, width + 1.6], [colourOf(bone), width]]) {
+          pen.beginPath();
+          pen.moveTo(a[0], a[1]);
+          pen.lineTo(b[0], b[1]);
+          pen.strokeStyle = colour;
+          pen.lineWidth = wide;
+          pen.stroke();
+        }
+        return;
+      }
+      const radius = data.headRadius * head[3];
+      for (const [colour, size] of [[colours.paper, radius + 0.8], [colourOf(null), radius]]) {
+        circle(pen, head, size);
+        pen.fillStyle = colour;
+        pen.fill();
+      }
+    });
+  };
+  const ring = (pen, place, size) => {
+    circle(pen, place, size);
     pen.lineWidth = 1.5;
     pen.strokeStyle = colours.seen;
     pen.stroke();
   };
+  // Colour of a standard deviation, millimetres.
+  const shade = (sd) => {
+    const at = 2 * Math.min(1, sd / data.largestSd);
+    const [from, to] = at < 1 ? ["certain", "between"] : ["between", "uncertain"];
+    const channel = (name, place) => parseInt(colours[name].slice(1 + 2 * place, 3 + 2 * place), 16);
+    const mixed = [0, 1, 2].map(
+      (place) => channel(from, place) + (at - Math.floor(Math.min(at, 1))) *
+        (channel(to, place) - channel(from, place)),
+    );
+    return `rgb(${mixed.map(Math.round)})`;
+  };
+  // Colours of bones: by their side, or by the standard deviations of their joints.
+  const colouring = (pen, joints, sd, frame) => {
+    if (!sd) return (bone) => colours[data.overlaid ? "ink" : (bone?.[2] ?? "ink")];
+    const of = (joint) => shade(sd[data.joints * frame + joint]);
+    return (bone) => {
+      if (!bone) return of(data.head[0]);
+      const [a, b] = [joints[bone[0]], joints[bone[1]]];
+      const gradient = pen.createLinearGradient(a[0], a[1], b[0], b[1]);
+      gradient.addColorStop(0, of(bone[0]));
+      gradient.addColorStop(1, of(bone[1]));
+      return gradient;
+    };
+  };
 
-  const drawPlace = (pen, numbers, frame, scale, thin) => {
+  const drawPlace = (pen, motions, sd, frame, scale) => {
     const film = throughCamera ? filmed(frame) : null;
     const see = film ? film.body : turned();
     const pixels = (...where) => {
-      const [x, y, near] = see(...where);
-      return [scale * x, scale * y, near];
+      const [x, y, near, size] = see(...where);
+      return [scale * x, scale * y, near, scale * size];
     };
     const [low, r] = [data.low, data.reach / Math.SQRT2];
-    const corners = [[-r, -r], [r, -r], [r, r], [-r, r], [-r, -r]];
-    path(pen, corners.map(([x, z]) => pixels(x, low, z)), colours.rule, 1);
-    if (decoded.truth && truthBox.checked) {
-      const joints = jointsOf(decoded.truth, frame, pixels);
-      data.bones.forEach(([a, b]) => path(pen, [joints[a], joints[b]], colours.ghost, 2.4 * thin));
+    pen.beginPath();
+    for (const [x, z] of [[-r, -r], [r, -r], [r, r], [-r, r]]) {
+      pen.lineTo(...pixels(x, low, z).slice(0, 2));
     }
-    const joints = jointsOf(numbers, frame, pixels);
-    const near = ([a, b]) => joints[a][2] + joints[b][2];
-    const bones = [...data.bones].sort((one, other) => near(one) - near(other));
-    bones.forEach(([a, b, side]) => path(pen, [joints[a], joints[b]], colours[side], 1.2 * thin));
+    pen.closePath();
+    pen.fillStyle = colours.ground;
+    pen.fill();
+    const flat = (x, _, z) => pixels(x, low, z);
+    silhouette(pen, jointsOf(motions[0], frame, flat), colours.shadow, 1, 0.8);
+    const isTruth = data.overlaid && motions.length === 1;
+    if (decoded.truth && truthBox.checked && !isTruth) {
+      silhouette(pen, jointsOf(decoded.truth, frame, pixels), colours.ghost, 1, 1.25);
+    }
+    motions.slice(1).forEach((other) => {
+      silhouette(pen, jointsOf(other, frame, pixels), colours.ink, 0.12, 0.7);
+    });
+    const joints = jointsOf(motions[0], frame, pixels);
+    body(pen, joints, colouring(pen, joints, sd, frame));
+    const size = Math.max(2, 0.7 * data.thickness * scale);
     for (let joint = 0; joint < data.joints; joint++) {
       const at = frame * data.joints + joint;
       if (decoded.dots && !isNaN(decoded.dots[3 * at])) {
-        dot(pen, pixels(...decoded.dots.subarray(3 * at, 3 * at + 3)), 1.3 * thin);
+        ring(pen, pixels(...decoded.dots.subarray(3 * at, 3 * at + 3)), size);
       }
       if (film && decoded.keypoints && !isNaN(decoded.keypoints[2 * at])) {
         const [x, y] = film.keypoint(...decoded.keypoints.subarray(2 * at, 2 * at + 2));
-        dot(pen, [scale * x, scale * y], 1.3 * thin);
+        ring(pen, [scale * x, scale * y], size);
       }
     }
   };
 
   const canvases = [...element.querySelectorAll("canvas")];
-  const drawCanvas = (canvas, motions, frame) => {
+  const drawCanvas = (canvas, row, frame) => {
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
     if (!width) return;
     const sharp = window.devicePixelRatio || 1;
@@ -128,22 +215,23 @@
     pen.lineCap = pen.lineJoin = "round";
     const place = width / data.columns;
     const scale = Math.min(place / data.across, height / data.up);
-    const thin = Math.max(1, Math.min(1.8, height / 130));
-    motions.forEach((numbers, column) => {
+    const motions = decoded.rows[row];
+    const places = data.overlaid ? [motions] : motions.map((each) => [each]);
+    places.forEach((shown, column) => {
       pen.setTransform(sharp, 0, 0, sharp, sharp * column * place, 0);
       pen.save();
       pen.beginPath();
       pen.rect(0, 0, place, height);
       pen.clip();
       pen.translate(place / 2, height / 2);
-      drawPlace(pen, numbers, frame, scale, thin);
+      drawPlace(pen, shown, decoded.sds[row], frame, scale);
       pen.restore();
     });
   };
   const draw = () => {
     const frame = Math.floor(moment);
     decode();
-    canvases.forEach((canvas, row) => drawCanvas(canvas, decoded.rows[row], frame));
+    canvases.forEach((canvas, row) => drawCanvas(canvas, row, frame));
     range.value = frame;
     const words = `frame ${frame + 1} of ${data.frames}`;
     range.setAttribute("aria-valuetext", words);
@@ -235,7 +323,15 @@
     if (decoded) draw();
   };
   window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", repaint);
-  ["beforeprint", "afterprint", "resize"].forEach((when) => window.addEventListener(when, repaint));
+  window.addEventListener("resize", repaint);
+  // Print also animations that were never on the screen, on white paper.
+  const print = (printing) => {
+    document.documentElement.classList.toggle("printing", printing);
+    readColours();
+    if (printing || decoded) draw();
+  };
+  window.addEventListener("beforeprint", () => print(true));
+  window.addEventListener("afterprint", () => print(false));
   readColours();
   const appear = () => {
     visible = true;

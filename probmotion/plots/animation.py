@@ -170,7 +170,7 @@ Camera’s view</button>
 <label{_hidden(problem.truth is None)}><input type="checkbox" data-does="truth" checked> \
 truth</label>
 </div>
-<ul class="key quiet">{_key(problem)}</ul>
+<ul class="key quiet">{_key(shown, data["largestSd"])}</ul>
 <div class="cards" role="group" tabindex="0" {attributes}>
 {chr(10).join([*cards, *further_cards])}
 </div>
@@ -200,15 +200,21 @@ def _hidden(hidden: bool) -> str:
     return " hidden" if hidden else ""
 
 
-def _key(problem: StoredProblem) -> str:
+def _key(shown: Shown, largest_sd: float) -> str:
+    problem = shown.problem
     entries = [("left", "left side"), ("right", "right side")]
-    entries = entries if problem.skeleton.mirrored_pairs else []
+    entries = entries if problem.skeleton.mirrored_pairs and not shown.overlaid else []
     if problem.truth is not None:
         entries.append(("ghost", "truth"))
     items = [
         f'<li><span style="background: var(--{colour})"></span>{words}</li>'
         for colour, words in entries
     ]
+    if shown.overlaid and max(map(len, shown.rows.values())) > 1:
+        items.append(
+            f'<li>posterior sd of joints: 0 <span class="sd"></span>{largest_sd / 10:g} cm</li>'
+        )
+        items.append('<li><span class="others"></span>other draws</li>')
     if problem.joints is not None:
         items.append('<li><span class="ring"></span>observed noisy 3D joints</li>')
     if problem.keypoints is not None:

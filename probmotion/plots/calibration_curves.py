@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from probmotion.plots.style import CYCLE, INK, finish_figure, legend_below, plain_axes
+from probmotion.plots.style import (
+    CYCLE,
+    finish_figure,
+    legend_below,
+    paper_panels,
+    plain_axes,
+    title_axes,
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -28,23 +35,21 @@ def draw_calibration(
         kinds have the same terms. A single pose is drawn as a line. Values below the lowest bin,
         which starts at about the 1 % quantile of all finite values, are drawn in this bin.
     path : str or Path, optional
-        PNG file to write.
+        File to write: .png, .pdf or .svg.
 
     Raises
     ------
     ValueError
         If ``levels`` is empty, or the kinds have different terms.
     """
-    from matplotlib.figure import Figure
-
     if not levels:
         raise ValueError("levels must contain at least one kind of pose, got none")
     terms = list(next(iter(levels.values())))
     for kind, by_term in levels.items():
         if list(by_term) != terms:
             raise ValueError(f"levels[{kind!r}] must have the terms {terms}, got {list(by_term)}")
-    figure = Figure(figsize=(0.4 + 3.4 * len(terms), 3.2), layout="constrained")
-    for axes, term in zip(figure.subplots(1, len(terms), squeeze=False)[0], terms, strict=True):
+    figure, panels = paper_panels(len(terms), 2.3, across=3)
+    for axes, term in zip(panels, terms, strict=True):
         values = {kind: np.asarray(by_term[term]) for kind, by_term in levels.items()}
         finite = np.concatenate([level[np.isfinite(level)] for level in values.values()])
         # Low outliers would compress the histograms.
@@ -57,10 +62,12 @@ def draw_calibration(
                 continue
             weights = np.full(level.size, 1 / level.size)
             clipped = np.maximum(level, edges[0])
-            axes.hist(clipped, edges, weights=weights, color=colour, alpha=0.55, label=kind)
-        axes.set_title(term, loc="left", size=10.5, color=INK)
-        axes.set_xlabel("nats", color=INK)
+            axes.hist(
+                clipped, edges.tolist(), weights=weights, color=colour, alpha=0.55, label=kind
+            )
+        title_axes(axes, term)
+        axes.set_xlabel("log density (nats)")
         plain_axes(axes)
-    figure.axes[0].set_ylabel("proportion", color=INK)
-    legend_below(figure, len(levels))
+    panels[0].set_ylabel("proportion")
+    legend_below(figure, min(len(levels), 4))
     return finish_figure(figure, path)

@@ -10,13 +10,14 @@ import numpy as np
 
 from probmotion.plots.style import (
     GREY,
-    INK,
     LEFT,
     check_columns,
     finish_figure,
     legend_below,
+    paper_panels,
     plain_axes,
     style_of,
+    title_axes,
 )  # fmt: skip
 from probmotion.validation import check_count, check_finite, check_shape
 
@@ -30,9 +31,9 @@ __all__ = ["classical_scaling", "draw_coverage", "draw_embedding"]
 # Colour, marker and size of each kind of pose, in drawing order.
 _KINDS = {
     "real": (LEFT, "o", 9.0),
-    "prior": ("#009E73", "o", 9.0),
-    "posterior": ("#B8578F", "o", 9.0),
-    "seed": ("#000000", "x", 70.0),
+    "prior": ("#009E73", "^", 10.0),
+    "posterior": ("#B8578F", "D", 7.0),
+    "seed": ("#000000", "x", 45.0),
 }
 _TITLES = {
     "interaction": "interaction coordinates (m)",
@@ -95,7 +96,7 @@ def draw_embedding(
     kinds : sequence of str, (n,)
         Kind of each pose: ``"real"``, ``"prior"``, ``"posterior"`` or ``"seed"``.
     path : str or Path, optional
-        PNG file to write.
+        File to write: .png, .pdf or .svg.
     counts : mapping of str to int, optional
         Number of draws of the prior, and of the posterior, in each panel, by title of the panel.
         By default, one panel shows all draws.
@@ -105,24 +106,23 @@ def draw_embedding(
     ValueError
         If shapes do not match or a kind is unknown.
     """
-    from matplotlib.figure import Figure
-
     points = np.asarray(points, dtype=np.float64)
     check_shape("points", points, ("n", 2))
     check_shape("kinds", np.asarray(kinds), (len(points),))
     if unknown := sorted(set(kinds) - set(_KINDS)):
         raise ValueError(f"kinds must be {', '.join(_KINDS)}, got {', '.join(unknown)}")
     panels: Mapping[str, int | None] = {"": None} if counts is None else counts
-    figure = Figure(figsize=(0.3 + 3.6 * len(panels), 4.1), layout="constrained")
-    shown = figure.subplots(1, len(panels), squeeze=False, sharex=True, sharey=True)[0]
+    figure, shown = paper_panels(
+        len(panels), 3.6 if len(panels) == 1 else 2.6, across=3, sharex=True, sharey=True
+    )
     for axes, (label, count) in zip(shown, panels.items(), strict=True):
         _draw_points(axes, points, np.asarray(kinds), count)
-        axes.set_title(label, size=10, color=INK)
+        title_axes(axes, label)
     middle, reach = 0.5 * (points.min(axis=0) + points.max(axis=0)), np.ptp(points, axis=0).max()
     limits = np.stack([middle - 0.54 * reach, middle + 0.54 * reach], axis=1)
     shown[0].set(xlim=limits[0], ylim=limits[1])
     ncols = len(shown[-1].collections) if len(panels) > 1 else 2
-    legend_below(figure, ncols, axes=shown[-1], markerscale=1.5)
+    legend_below(figure, ncols, axes=shown[-1])
     return finish_figure(figure, path)
 
 
@@ -137,30 +137,27 @@ def draw_coverage(table: pd.DataFrame, path: str | Path | None = None) -> Figure
         Columns ``measure``, ``density``, ``draws`` and ``coverage``. Rows that differ only in
         coverage, such as seeds, are drawn as their mean with an error bar from minimum to maximum.
     path : str or Path, optional
-        PNG file to write.
+        File to write: .png, .pdf or .svg.
 
     Raises
     ------
     ValueError
         If a column is missing, the table is empty or a number of draws is below 1.
     """
-    from matplotlib.figure import Figure
-
     check_columns(table, ("measure", "density", "draws", "coverage"))
     if not (table["draws"] >= 1).all():
         raise ValueError(f"draws in table must be at least 1, got {table['draws'].min()}")
     measures = list(dict.fromkeys(table["measure"]))
     densities = list(dict.fromkeys(table["density"]))
-    figure = Figure(figsize=(0.4 + 3.4 * len(measures), 3.7), layout="constrained")
-    panels = figure.subplots(1, len(measures), squeeze=False)[0]
+    figure, panels = paper_panels(len(measures), 2.6, across=3)
     for axes, measure in zip(panels, measures, strict=True):
         rows = table[table["measure"] == measure]
         for index, density in enumerate(densities):
             _draw_line(axes, rows[rows["density"] == density], str(density), index)
-        axes.set_title(_TITLES.get(measure, measure), loc="left", size=10.5, color=INK)
+        title_axes(axes, _TITLES.get(measure, measure))
         _style_coverage_axes(axes)
-    panels[0].set_ylabel("coverage: mean distance of a real pair\nto the nearest draw", color=INK)
-    legend_below(figure, len(densities))
+    panels[0].set_ylabel("mean distance of a real pair\nto the nearest draw")
+    legend_below(figure, min(len(densities), 4 if len(measures) > 1 else 2))
     return finish_figure(figure, path)
 
 
@@ -171,7 +168,7 @@ def _draw_line(axes: Axes, rows: pd.DataFrame, density: str, place: int) -> None
     colour, marker = style_of(place)
     axes.errorbar(
         counts, mean, bars, label=density, color=colour, marker=marker,
-        markersize=5, linewidth=1.6, elinewidth=1.0,
+        markersize=4, linewidth=1.2, elinewidth=0.9, capsize=2,
     )  # fmt: skip
 
 
@@ -182,7 +179,7 @@ def _style_coverage_axes(axes: Axes) -> None:
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
     axes.yaxis.set_major_locator(MaxNLocator(5))
-    axes.set_xlabel("draws", color=INK)
+    axes.set_xlabel("draws")
     plain_axes(axes, grid="both")
 
 

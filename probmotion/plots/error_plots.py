@@ -7,7 +7,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from probmotion.plots.style import CYCLE, INK, check_columns, finish_figure, plain_axes
+from probmotion.plots.style import (
+    CYCLE,
+    INK,
+    SMALL,
+    TITLE,
+    check_columns,
+    finish_figure,
+    legend_below,
+    paper_panels,
+    plain_axes,
+    title_axes,
+)  # fmt: skip
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -18,12 +29,13 @@ __all__ = ["draw_error_decomposition"]
 
 _FLOOR, _WHOLE = "floor", "whole"  # table rows of exact draws and of the sum of parts
 _COLOURS = {
-    part: CYCLE[place]
-    for part, place in (
-        ("remainder", 8), ("discretisation", 2), ("single view", 3), ("noise sharing", 4),
-        ("guidance", 5), ("network", 1),
-    )
-}  # fmt: skip
+    "remainder": "#7A7A7A",
+    "discretisation": CYCLE[2],
+    "single view": CYCLE[3],
+    "noise sharing": CYCLE[4],
+    "guidance": CYCLE[5],
+    "network": CYCLE[1],
+}
 _PALE, _FULL = 0.35, 0.95  # opacities
 _WIDTH = 0.8  # of the stack
 _LETTERS = 26  # maximum line length of panel titles
@@ -47,7 +59,7 @@ def draw_error_decomposition(
     table : DataFrame
         Table of :meth:`~probmotion.calibration.error_result.ErrorDecomposition.table`, one setting.
     path : str or Path, optional
-        PNG file to write.
+        File to write: .png, .pdf or .svg.
     words : mapping of str to str, optional
         Titles of the panels, by name of the metric; the names by default.
     notes : sequence of str
@@ -58,8 +70,6 @@ def draw_error_decomposition(
     ValueError
         If a column is missing, or the table has several settings.
     """
-    from matplotlib.figure import Figure
-
     check_columns(table, ("setting", "measure", "part", "mean", "low", "high"))
     settings = list(dict.fromkeys(table["setting"]))
     if len(settings) != 1:
@@ -67,8 +77,7 @@ def draw_error_decomposition(
     measures = list(dict.fromkeys(table["measure"]))
     parts = [part for part in dict.fromkeys(table["part"]) if part not in (_FLOOR, _WHOLE)]
     colours = {part: _COLOURS.get(part, CYCLE[6 + index % 2]) for index, part in enumerate(parts)}
-    figure = Figure(figsize=(0.8 + 2.75 * len(measures), 4.6), layout="constrained")
-    panels = figure.subplots(1, len(measures), squeeze=False)[0]
+    figure, panels = paper_panels(len(measures), 2.9, across=3)
     for axes, measure in zip(panels, measures, strict=True):
         rows = table[table["measure"] == measure].set_index("part")
         _draw_stack(axes, rows, colours)
@@ -76,12 +85,12 @@ def draw_error_decomposition(
         axes.axhline(0.0, color=INK, linewidth=0.8)
         axes.set_xlim(-0.6, 0.25 + 0.55 * (len(parts) + 1) + 0.4)
         axes.set_xticks([])
+        title_axes(axes, textwrap.fill((words or {}).get(measure, measure), _LETTERS))
         plain_axes(axes, ("top", "right", "bottom"), grid="y")
-        title = textwrap.fill((words or {}).get(measure, measure), _LETTERS)
-        axes.set_title(title, loc="left", size=10, color=INK)
-    figure.axes[0].set_ylabel("above exact draws", color=INK, size=9.5)
-    _write_key(figure, colours, notes)
-    figure.suptitle(settings[0], size=12, color=INK, x=0.01, ha="left", weight="bold")
+    for axes in panels[::3]:
+        axes.set_ylabel("above exact draws")
+    _write_key(figure, colours, notes, wide=len(measures) > 1)
+    figure.suptitle(settings[0], size=TITLE, color=INK, x=0.01, ha="left", weight="bold")
     return finish_figure(figure, path)
 
 
@@ -96,7 +105,7 @@ def _draw_stack(axes: Axes, rows: pd.DataFrame, colours: Mapping[str, str]) -> N
         )  # fmt: skip
         up, down = (up + height, down) if height >= 0 else (up, down + height)
     total = float(rows.loc[_WHOLE, "mean"])
-    axes.plot([-0.55 * _WIDTH, 0.55 * _WIDTH], [total, total], color="black", linewidth=2.2)
+    axes.plot([-0.55 * _WIDTH, 0.55 * _WIDTH], [total, total], color="black", linewidth=1.8)
 
 
 def _draw_intervals(axes: Axes, rows: pd.DataFrame, colours: Mapping[str, str]) -> None:
@@ -106,21 +115,24 @@ def _draw_intervals(axes: Axes, rows: pd.DataFrame, colours: Mapping[str, str]) 
         x = 0.25 + 0.55 * index
         opacity = _opacity(row)
         axes.plot([x, x], [row["low"], row["high"]], color=colour, alpha=opacity,
-                  linewidth=2.2, solid_capstyle="butt")  # fmt: skip
+                  linewidth=1.6, solid_capstyle="butt")  # fmt: skip
         axes.plot(x, row["mean"], "o" if part != _WHOLE else "D", color=colour, alpha=opacity,
-                  markersize=5.5)  # fmt: skip
+                  markersize=4)  # fmt: skip
 
 
-def _write_key(figure: Figure, colours: Mapping[str, str], notes: Sequence[str]) -> None:
+def _write_key(
+    figure: Figure, colours: Mapping[str, str], notes: Sequence[str], wide: bool
+) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     handles: list[Any] = [Patch(color=colour, label=part) for part, colour in colours.items()]
-    handles.append(Line2D([], [], color="black", marker="D", markersize=5, label=_WHOLE))
+    handles.append(Line2D([], [], color="black", marker="D", markersize=4, label=_WHOLE))
     handles.append(Line2D([], [], linestyle="", label="pale: interval contains 0"))
-    key = figure.legend(
-        handles=handles, loc="outside lower center", ncols=len(handles), frameon=False,
-        labelcolor=INK, fontsize=9, title="; ".join(notes), title_fontsize=8.5,
+    labels = [handle.get_label() for handle in handles]
+    key = legend_below(
+        figure, 4 if wide else 2, handles=handles, labels=labels,
+        title=textwrap.fill("; ".join(notes), 110 if wide else 50), title_fontsize=SMALL,
     )  # fmt: skip
     key.get_title().set_color(INK)
 

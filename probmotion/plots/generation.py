@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from probmotion.plots.style import (
-    INK,
     LEFT,
     RIGHT,
     check_columns,
     finish_figure,
     legend_below,
+    log_axis,
+    paper_panels,
     plain_axes,
+    title_axes,
 )  # fmt: skip
 
 if TYPE_CHECKING:
@@ -27,6 +29,7 @@ __all__ = ["draw_generation"]
 
 # Marker, colour and fill colour by direction of the views.
 _VIEWS = {"all around": ("o", LEFT, LEFT), "from the side": ("s", RIGHT, "white")}
+_ACROSS = 3  # panels per row
 
 
 def draw_generation(
@@ -48,7 +51,7 @@ def draw_generation(
     measures : mapping of str to str
         Titles of the panels, by name of the metric.
     path : str or Path, optional
-        PNG file to write.
+        File to write: .png, .pdf or .svg.
     logarithmic : sequence of str
         Names of the metrics with a logarithmic axis.
 
@@ -57,24 +60,24 @@ def draw_generation(
     ValueError
         If the table has no rows, or a column is missing.
     """
-    from matplotlib.figure import Figure
-
     check_columns(table, ("name", *measures))
-    size = (1.6 + 2.4 * len(measures), 1.2 + 0.28 * len(table))
-    figure = Figure(figsize=size, layout="constrained")
-    panels = figure.subplots(1, len(measures), squeeze=False, sharey=True)[0]
+    figure, panels = paper_panels(
+        len(measures), 0.7 + 0.24 * len(table), across=_ACROSS, sharey=True
+    )
     heights = np.arange(len(table))[::-1]
     for axes, (measure, title) in zip(panels, measures.items(), strict=True):
         _draw_markers(axes, table, measure, heights + 0.12, "all around")
         _draw_markers(axes, table, f"{measure}_side", heights - 0.12, "from the side")
-        axes.set_title(title, loc="left", size=10, color=INK)
+        title_axes(axes, title)
         if measure in logarithmic:
-            axes.set_xscale("log")
+            values = table[[c for c in (measure, f"{measure}_side") if c in table]].to_numpy(float)
+            axes.set_xlim(log_axis(axes.xaxis, values[values > 0]))
         else:
-            axes.set_xlim(left=0)
+            # Markers at 0 are not clipped.
+            axes.set_xlim(left=-0.04 * axes.get_xlim()[1])
         plain_axes(axes, grid="both")
     panels[0].set_yticks(heights, list(table["name"]))
-    legend_below(figure, 2)
+    legend_below(figure, 2, axes=panels[0])
     return finish_figure(figure, path)
 
 
@@ -86,6 +89,6 @@ def _draw_markers(
     shape, colour, face = _VIEWS[label]
     deviations = table.get(f"{measure}_sd")
     axes.errorbar(
-        table[measure], places, xerr=deviations, fmt=shape, color=colour, markersize=5,
-        markerfacecolor=face, elinewidth=1.0, label=label,
+        table[measure], places, xerr=deviations, fmt=shape, color=colour, markersize=4,
+        markerfacecolor=face, elinewidth=0.9, capsize=2, label=label,
     )  # fmt: skip

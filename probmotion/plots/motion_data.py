@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +12,8 @@ import numpy as np
 from probmotion.comparison.results.stored_problems import StoredProblem
 from probmotion.geometry.cameras import Cameras
 from probmotion.interaction.geometry.coordinates import align_motions
-from probmotion.plots.skeletons import face_heading, joint_sides
+from probmotion.motion.skeleton import Skeleton
+from probmotion.plots.skeletons import face_heading, head_joints, joint_sides
 
 __all__ = ["Shown", "choose_draws", "motion_numbers"]
 
@@ -23,6 +24,9 @@ _LARGEST = np.iinfo(np.int16).max
 _TILT = 0.3
 # Name of each side's colour in the style sheet.
 _SIDES = {"middle": "ink", "left": "left", "right": "right"}
+# Diameter of a limb and radius of a head, relative to the sum of all bone lengths.
+_LIMB, _HEAD_RADIUS = 0.019, 0.026
+_MAX_OVERLAID = 4  # Maximum number of overlaid draws.
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,18 +34,21 @@ class Shown:
     """Motions of an animation: ``rows`` (n, L, J, 3) by label, metres, every ``step``-th frame.
 
     The first row determines the scale. If ``turned`` and the problem has no observations or truth,
-    motions are rotated to a common heading and single poses are aligned with the first pose.
+    motions are rotated to a common heading and single poses are aligned with the first pose. If
+    ``overlaid``, draws of a row are shown on top of each other, and colours of the first draw are
+    standard deviations over all draws; the first two rows determine the scale.
     """
 
     problem: StoredProblem
     rows: Mapping[str, np.ndarray]
     step: int = 1
     turned: bool = True
+    overlaid: bool = False
 
     @property
     def frames(self) -> int:
         """Number of frames of the animation."""
-        return -(-next(iter(self.rows.values())).shape[1] // self.step)
+        return -(-int(next(iter(self.rows.values())).shape[1]) // self.step)
 
 
 def choose_draws(motions: np.ndarray, n: int) -> np.ndarray:
@@ -67,21 +74,32 @@ def motion_numbers(shown: Shown) -> dict[str, Any]:
         truth = None if truth is None else truth - path[:, None]
     else:
         rows = _centred(rows, shown)
-    first = next(iter(rows.values()))
+    scaling = [*rows.values()][: 2 if shown.overlaid else 1]
     sides = joint_sides(skeleton)
+    sds: list[np.ndarray | None] = [None] * len(rows)
+    if shown.overlaid:
+        sds = [_standard_deviation(motions) for motions in rows.values()]
+        rows = {label: motions[:_MAX_OVERLAID] for label, motions in rows.items()}
+    length = np.mean([_total_bone_length(motions, skeleton) for motions in scaling])
     data: dict[str, Any] = {
         "fps": problem.fps / step,
         "frames": shown.frames,
         "joints": skeleton.n_joints,
         "bones": [(*bone, _SIDES[sides[bone[0]]]) for bone in skeleton.bones],
-        "columns": max(map(len, rows.values())),
+        "head": head_joints(skeleton),
+        "thickness": round(_LIMB * length, 4),
+        "headRadius": round(_HEAD_RADIUS * length, 4),
+        "overlaid": shown.overlaid,
+        "sds": [None if sd is None else _base64(np.rint(sd).astype("<i2")) for sd in sds],
+        "largestSd": _largest(sds),
+        "columns": 1 if shown.overlaid else max(map(len, rows.values())),
         "azimuth": 0.6,
         "rows": [[_encoded(motion) for motion in motions] for motions in rows.values()],
         "truth": None if truth is None else _encoded(truth),
         "dots": None,
         "keypoints": None,
         "camera": None,
-        **_extent(first if truth is None else np.concatenate([first, truth[None]])),
+        **_extent(np.concatenate(scaling if truth is None else [*scaling, truth[None]])),
     }
     if path is not None and problem.joints is not None:
         data["dots"] = _base64((problem.joints[::step] - path[:, None]).astype("<f4"))
@@ -89,6 +107,29 @@ def motion_numbers(shown: Shown) -> dict[str, Any]:
         data |= _camera(problem.camera, problem.keypoints, step)
         data["anchor"] = np.round(path[:, [0, 2]], 4).tolist()
     return data
+
+
+def _standard_deviation(motions: np.ndarray) -> np.ndarray | None:
+    """Return the standard deviation of each joint's position, (L, J), millimetres."""
+    if len(motions) < 2:
+        return None
+    return np.asarray(1000 * np.sqrt(motions.var(axis=0, ddof=1).sum(axis=-1)))
+
+
+def _largest(sds: Sequence[np.ndarray | None]) -> float:
+    """Return the end of the colour scale, a multiple of 20 mm: 1.5 times the sd of the first row.
+
+    Overconfident rows then have the colours of small values, underconfident ones of large values.
+    """
+    first = next((sd for sd in sds if sd is not None), np.zeros(1))
+    return 20.0 * max(1.0, float(np.ceil(1.5 * np.quantile(first, 0.95) / 20)))
+
+
+def _total_bone_length(motions: np.ndarray, skeleton: Skeleton) -> float:
+    """Return the mean over frames of the sum of bone lengths of one body, metres."""
+    child, parent = np.array(skeleton.bones).T
+    lengths = np.linalg.norm(motions[:, :, child] - motions[:, :, parent], axis=-1)
+    return float(lengths.sum(axis=-1).mean()) / len(skeleton.roots)
 
 
 def _centred(rows: Mapping[str, np.ndarray], shown: Shown) -> dict[str, np.ndarray]:

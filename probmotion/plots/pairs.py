@@ -10,7 +10,8 @@ import numpy as np
 
 from probmotion.geometry.cameras import Cameras
 from probmotion.motion.skeleton import Skeleton
-from probmotion.plots.style import GREY, INK, LEFT, RIGHT, finish_figure
+from probmotion.plots.skeletons import draw_ground, write_key
+from probmotion.plots.style import INK, LEFT, PAGE, RIGHT, SIZE, finish_figure
 from probmotion.validation import check_count, check_finite, check_shape
 
 if TYPE_CHECKING:
@@ -21,8 +22,8 @@ __all__ = ["draw_pairs"]
 
 # Colours of characters in the order of their roots, repeated after the fourth.
 _CHARACTERS = (LEFT, RIGHT, "#009E73", "#B8578F")
-# Space for row labels, for the title and between figures, inches.
-_LABEL, _TITLE, _GAP = 1.15, 0.42, 0.1
+# Space for the title and between figures, and maximum width of a figure, inches.
+_TOP, _GAP, _MAX_WIDTH = 0.36, 0.08, 1.6
 
 
 def draw_pairs(
@@ -47,7 +48,7 @@ def draw_pairs(
     skeleton : Skeleton
         Skeleton of the J joints; each of its trees is a character.
     path : str or Path, optional
-        PNG file to write.
+        File to write: .png, .pdf or .svg.
     columns : int
         Maximum number of pose-pairs per row, counted from the first.
     azimuth, elevation : float
@@ -112,27 +113,28 @@ def _compose(lines: list[_Row], skeleton: Skeleton, title: str) -> Figure:
 
     reach = 1.04 * max(float(np.nanmax(line.poses[..., 0])) for line in lines) + 1e-9
     slots = max(len(line.poses) for line in lines)
-    slot = max(1.2, 5.0 / slots)
+    # A letter of a row label is about 0.075 inches wide.
+    label_width = 0.25 + 0.075 * max(len(line.label) for line in lines)
+    slot = min((PAGE - label_width) / slots - _GAP, _MAX_WIDTH)
     scale = slot / (2 * reach)
-    width = _LABEL + slots * (slot + _GAP)
-    height = _TITLE + sum((line.span[1] - line.span[0]) * scale + _GAP for line in lines)
-    figure = Figure(figsize=(width, height))
-    top = height - _TITLE
+    height = _TOP + sum((line.span[1] - line.span[0]) * scale + _GAP for line in lines)
+    figure = Figure(figsize=(PAGE, height))
+    top = height - _TOP
     for line in lines:
         low, high = line.span
         tall = (high - low) * scale
         bottom = top - tall
-        label_at = ((_LABEL - 0.12) / width, (bottom + tall / 2) / height)
-        figure.text(*label_at, line.label, ha="right", va="center", size=10, color=INK)
+        label_at = ((label_width - 0.1) / PAGE, (bottom + tall / 2) / height)
+        figure.text(*label_at, line.label, ha="right", va="center", size=SIZE, color=INK)
         for column, pose in enumerate(line.poses):
-            left = _LABEL + column * (slot + _GAP)
-            axes = figure.add_axes((left / width, bottom / height, slot / width, tall / height))
+            left = label_width + column * (slot + _GAP)
+            axes = figure.add_axes((left / PAGE, bottom / height, slot / PAGE, tall / height))
             axes.set(xlim=(-reach, reach), ylim=(low, high))
             axes.set_axis_off()
             axes.set_facecolor("none")
             _draw_pair(axes, pose, skeleton, line.is_3d)
         top = bottom - _GAP
-    figure.text(0.12 / width, 1 - 0.1 / height, title, va="top", size=12, color=INK)
+    write_key(figure, title, {})
     return figure
 
 
@@ -140,8 +142,7 @@ def _draw_pair(axes: Axes, pose: np.ndarray, skeleton: Skeleton, is_3d: bool) ->
     from matplotlib.collections import LineCollection
 
     if is_3d:
-        low = axes.get_ylim()[0]
-        axes.plot(axes.get_xlim(), [low, low], color=GREY, linewidth=1.2, solid_capstyle="butt")
+        draw_ground(axes)
     right = {joint for _, joint in skeleton.mirrored_pairs}
     for index, root in enumerate(skeleton.roots):
         bones = [
@@ -150,7 +151,7 @@ def _draw_pair(axes: Axes, pose: np.ndarray, skeleton: Skeleton, is_3d: bool) ->
             if root in skeleton.ancestors(joint) and np.isfinite(pose[[joint, parent]]).all()
         ]
         colour = _CHARACTERS[index % len(_CHARACTERS)]
-        style: dict[str, Any] = {"capstyle": "round", "linewidths": 1.5, "colors": colour}
+        style: dict[str, Any] = {"capstyle": "round", "linewidths": 1.1, "colors": colour}
         style["linestyles"] = "solid" if is_3d else (0, (1.6, 1.6))
         for paler, alpha in ((True, 0.5), (False, 1.0)):
             chosen = [pose[list(bone)] for bone in bones if (bone[0] in right) == paler]

@@ -10,14 +10,24 @@ import numpy as np
 
 from probmotion.geometry.cameras import Cameras
 from probmotion.motion.skeleton import Skeleton
-from probmotion.plots.style import GREY, INK, LEFT, RIGHT, finish_figure
+from probmotion.plots.style import GREY, INK, LEFT, PAGE, RIGHT, SIZE, TITLE, finish_figure
 from probmotion.validation import check_count, check_finite, check_shape
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.patches import Circle
 
-__all__ = ["checked_rows", "draw_skeletons", "face_heading", "joint_sides"]
+__all__ = [
+    "WIDEST", "checked_rows", "draw_ground", "draw_skeletons", "face_heading", "head_circles",
+    "head_joints", "joint_sides", "project_frames", "write_key",
+]  # fmt: skip
+
+_HEAD = {"head", "head_top", "nose", "left_eye", "right_eye", "left_ear", "right_ear"}
+_HEAD_RADIUS = 0.022  # relative to the sum of all bone lengths
+_TOP, _GAP = 0.36, 0.06  # space for the title and between strips, inches
+WIDEST = 1.4  # maximum width of a slot, relative to that of the first row
+_MAX_STRIP_HEIGHT = 1.3  # maximum height of a strip, inches
 
 
 def draw_skeletons(
@@ -36,7 +46,7 @@ def draw_skeletons(
     """Return a figure with a row of filmstrips per entry of ``rows``.
 
     A strip shows ``moments`` frames of one motion side by side, the left side of the body in blue
-    and the right in red. All strips have the same scale; larger motions are clipped.
+    and the right in red. All strips have the same scale; much larger motions are clipped.
 
     Parameters
     ----------
@@ -45,7 +55,7 @@ def draw_skeletons(
     skeleton : Skeleton
         Skeleton of the J joints.
     path : str or Path, optional
-        PNG file to write.
+        File to write: .png, .pdf or .svg.
     draws : int
         Maximum number of motions per row, counted from the first.
     moments : int
@@ -72,16 +82,19 @@ def draw_skeletons(
             label: face_heading(motions, skeleton, heading) for label, motions in shown.items()
         }
     camera = Cameras.around(np.array([azimuth]), np.array([elevation]))
-    strips = {label: _project(camera, motions, moments) for label, motions in shown.items()}
-    truth_strip = None if truth is None else _project(camera, np.asarray(truth)[None], moments)[0]
+    strips = {label: project_frames(camera, motions, moments) for label, motions in shown.items()}
+    truth_strip = (
+        None if truth is None else project_frames(camera, np.asarray(truth)[None], moments)[0]
+    )
     return finish_figure(_compose(strips, skeleton, truth_strip, title), path)
 
 
 def checked_rows(
-    rows: Mapping[str, np.ndarray], skeleton: Skeleton, draws: int
+    rows: Mapping[str, np.ndarray], skeleton: Skeleton, draws: int | None = None
 ) -> dict[str, np.ndarray]:
     """Return the first draws of each row, (n, L, J, 3), after checking shapes and values."""
-    check_count("draws", draws)
+    if draws is not None:
+        check_count("draws", draws)
     if not rows:
         raise ValueError("rows must contain at least one label with motions, got none")
     shown = {}
@@ -118,7 +131,7 @@ def joint_sides(skeleton: Skeleton) -> list[str]:
     return sides
 
 
-def _project(camera: Cameras, motions: np.ndarray, moments: int) -> np.ndarray:
+def project_frames(camera: Cameras, motions: np.ndarray, moments: int) -> np.ndarray:
     """Project ``(n, L, J, 3) → (n, moments, J, 2)``, in metres with y up."""
     frames = np.linspace(0, motions.shape[1] - 1, moments).round().astype(int)
     return camera.project(motions[:, frames])[:, 0] * np.array([1.0, -1.0])
@@ -132,30 +145,31 @@ def _compose(
     moments = next(iter(strips.values())).shape[1]
     columns = max(len(strip) for strip in strips.values())
     slot, low, high = _extent(strips, truth)
-    strip_width = max(2.35, 7.0 / columns)
-    strip_height = strip_width * (high - low) / (slot * moments)
-    # A letter of a row label is about 0.09 inches wide.
-    label_width, top_margin = max(1.15, 0.2 + 0.09 * max(map(len, strips))), 0.42
-    width = label_width + columns * (strip_width + 0.1)
-    height = top_margin + len(strips) * (strip_height + 0.08) + 0.05
-    figure = Figure(figsize=(width, height))
-    top = height - top_margin
+    # A letter of a row label is about 0.075 inches wide.
+    label_width = 0.25 + 0.075 * max(map(len, strips))
+    shape = (high - low) / (slot * moments)
+    strip_width = min((PAGE - label_width) / columns - _GAP, _MAX_STRIP_HEIGHT / shape)
+    strip_height = strip_width * shape
+    height = _TOP + len(strips) * (strip_height + _GAP)
+    figure = Figure(figsize=(PAGE, height))
+    top = height - _TOP
     for row, (label, motions) in enumerate(strips.items()):
-        bottom = top - (row + 1) * (strip_height + 0.08) + 0.08
+        bottom = top - (row + 1) * (strip_height + _GAP) + _GAP
         middle = (bottom + strip_height / 2) / height
         figure.text(
-            (label_width - 0.12) / width, middle, label, ha="right", va="center", size=10, color=INK
+            (label_width - 0.1) / PAGE, middle, label, ha="right", va="center", size=SIZE, color=INK
         )
         for column, motion in enumerate(motions):
-            left = label_width + column * (strip_width + 0.1)
-            box = (left / width, bottom / height, strip_width / width, strip_height / height)
+            left = label_width + column * (strip_width + _GAP)
+            box = (left / PAGE, bottom / height, strip_width / PAGE, strip_height / height)
             axes = figure.add_axes(box)
             axes.set(xlim=(0, slot * moments), ylim=(low, high))
             axes.set_aspect("equal")
             axes.set_axis_off()
             axes.set_facecolor("none")
-            _draw_strip(axes, motion, truth, skeleton, slot, low)
-    _write_key(figure, title, truth is not None, width, height)
+            _draw_strip(axes, motion, truth, skeleton, slot)
+    entries = {"left side": LEFT, "right side": RIGHT}
+    write_key(figure, title, entries if truth is None else entries | {"truth": "#8F8F8F"})
     return figure
 
 
@@ -168,54 +182,80 @@ def _anchor(motion: np.ndarray, truth: np.ndarray | None) -> np.ndarray:
 def _extent(
     strips: Mapping[str, np.ndarray], truth: np.ndarray | None
 ) -> tuple[float, float, float]:
-    """Return the width of a slot and the vertical range of the first row, metres."""
-    reference = np.stack([*next(iter(strips.values()))])
-    sideways = np.stack(
-        [np.abs(motion[..., 0] - _anchor(motion, truth)[:, None]) for motion in reference]
-    )
+    """Return the width of a slot, and the vertical range of the first row, metres."""
+    sideways = [
+        np.quantile(
+            [np.abs(motion[..., 0] - _anchor(motion, truth)[:, None]) for motion in row], 0.995
+        )
+        for row in strips.values()
+    ]
+    reference = next(iter(strips.values()))
     low, high = float(reference[..., 1].min()), float(reference[..., 1].max())
     margin = 0.08 * (high - low) + 1e-9
-    return 2.1 * float(np.quantile(sideways, 0.995)) + 1e-9, low - margin, high + margin
+    reach = min(max(sideways), WIDEST * sideways[0])
+    return 2.1 * float(reach) + 1e-9, low - margin, high + margin
 
 
 def _draw_strip(
-    axes: Axes,
-    motion: np.ndarray,
-    truth: np.ndarray | None,
-    skeleton: Skeleton,
-    slot: float,
-    low: float,
+    axes: Axes, motion: np.ndarray, truth: np.ndarray | None, skeleton: Skeleton, slot: float
 ) -> None:
-    from matplotlib.collections import LineCollection
+    from matplotlib.collections import LineCollection, PatchCollection
 
     moments = len(motion)
     shift = np.zeros((moments, 1, 2))
     shift[:, 0, 0] = slot * (np.arange(moments) + 0.5) - _anchor(motion, truth)
-    axes.plot([0, slot * moments], [low, low], color=GREY, linewidth=1.2, solid_capstyle="butt")
+    draw_ground(axes)
     style: dict[str, Any] = {"capstyle": "round", "joinstyle": "round"}
     if truth is not None:
         bones = _bones(truth + shift, skeleton.bones)
-        axes.add_collection(LineCollection(bones, colors=GREY, linewidths=2.6, **style))
+        axes.add_collection(LineCollection(bones, colors=GREY, linewidths=2.0, **style))
+        heads = head_circles(truth + shift, skeleton)
+        axes.add_collection(PatchCollection(heads, facecolors=GREY, zorder=2))
+    heads = head_circles(motion + shift, skeleton)
+    axes.add_collection(PatchCollection(heads, facecolors=INK, zorder=2))
     sides = joint_sides(skeleton)
     # Limbs are drawn over the trunk.
     for side, colour in (("middle", INK), ("right", RIGHT), ("left", LEFT)):
         chosen = [bone for bone in skeleton.bones if sides[bone[0]] == side]
         lines = _bones(motion + shift, chosen)
-        axes.add_collection(LineCollection(lines, colors=colour, linewidths=1.3, **style))
+        axes.add_collection(LineCollection(lines, colors=colour, linewidths=1.0, **style))
 
 
 def _bones(frames: np.ndarray, bones: Sequence[tuple[int, int]]) -> list:
     return [pose[[joint, parent]] for pose in frames for joint, parent in bones]
 
 
-def _write_key(figure: Figure, title: str, with_truth: bool, width: float, height: float) -> None:
-    """Write the title and, right-aligned, the legend of the colours."""
-    top = 1 - 0.1 / height
-    figure.text(0.12 / width, top, title, va="top", size=12, color=INK)
-    entries = [("left side", LEFT), ("right side", RIGHT)]
-    entries += [("truth", "#8F8F8F")] if with_truth else []
-    right = 1 - 0.12 / width
-    for words, colour in reversed(entries):
-        text = figure.text(right, top, words, ha="right", va="top", size=10, color=colour)
+def draw_ground(axes: Axes) -> None:
+    """Draw a grey line at the lower edge of axes."""
+    low = axes.get_ylim()[0]
+    axes.plot(axes.get_xlim(), [low, low], color=GREY, linewidth=1.2, solid_capstyle="butt")
+
+
+def head_joints(skeleton: Skeleton) -> list[int]:
+    """Return the joints of the head; its centre is their mean."""
+    return [joint for joint, name in enumerate(skeleton.canonical_names) if name in _HEAD]
+
+
+def head_circles(poses: np.ndarray, skeleton: Skeleton) -> list[Circle]:
+    """Return a circle at the head of each pose, (n, J, 2); none for skeletons without a head."""
+    from matplotlib.patches import Circle
+
+    head = head_joints(skeleton)
+    if not head:
+        return []
+    child, parent = np.array(skeleton.bones).T
+    lengths = np.linalg.norm(poses[:, child] - poses[:, parent], axis=-1)
+    radius = _HEAD_RADIUS * lengths.sum(axis=-1).max()
+    return [Circle(tuple(centre), radius) for centre in poses[:, head].mean(axis=1)]
+
+
+def write_key(figure: Figure, title: str, entries: Mapping[str, str]) -> None:
+    """Write the title and, right-aligned, a legend: coloured words."""
+    width, height = figure.get_size_inches()
+    top = 1 - 0.08 / height
+    figure.text(0.08 / width, top, title, va="top", size=TITLE, color=INK, weight="bold")
+    right = 1 - 0.08 / width
+    for words, colour in reversed(list(entries.items())):
+        text = figure.text(right, top, words, ha="right", va="top", size=SIZE, color=colour)
         text.set_fontweight("bold")
-        right -= (text.get_window_extent().width / figure.dpi + 0.16) / width
+        right -= (text.get_window_extent().width / figure.dpi + 0.14) / width

@@ -1,4 +1,5 @@
 from .draws import MotionDraws as MotionDraws
+from .finished import FinishedDraws as FinishedDraws
 from .likelihoods import Joints3D as Joints3D, Keypoints2D as Keypoints2D
 from .noise_schedule import NoiseSchedule as NoiseSchedule
 from .posterior import MotionPosterior as MotionPosterior

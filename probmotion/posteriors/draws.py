@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import asdict, dataclass, field, is_dataclass
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -16,6 +16,8 @@ import xarray as xr
 from probmotion.files import written_whole
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
+from probmotion.posteriors.arviz_groups import observation_groups, posterior_groups
+from probmotion.posteriors.protocols import Likelihood
 from probmotion.validation import check_finite, check_shape
 
 if TYPE_CHECKING:
@@ -37,9 +39,12 @@ class MotionDraws:
         coordinate), ``log_density`` (chain, draw), statistics per draw (chain, draw) or chain
         (chain), and ``state_*``, the sampler state for continuation. Attributes: skeleton, fps,
         sampler, settings, seed, versions, seconds and evaluation counts.
+    likelihood : Likelihood, optional
+        Likelihood of the posterior, for :meth:`to_arviz`; not stored in files.
     """
 
     dataset: xr.Dataset
+    likelihood: Likelihood | None = field(default=None, repr=False)
 
     @classmethod
     def of(
@@ -72,7 +77,8 @@ class MotionDraws:
         log_density : ndarray, (chains, draws), optional
             log p(θ) + log p(y | θ) of each draw.
         statistics : mapping of ndarray, optional
-            Arrays over (chain,) or (chain, draw): ``acceptance``, ``divergent``, …
+            Arrays over (chain,) or (chain, draw), named as in ArviZ: ``acceptance_rate``,
+            ``diverging``, ``n_steps``, ``energy``, …
         counts : mapping of int, optional
             Numbers of evaluations of ``denoiser``, ``density`` and ``gradient``, counted per
             motion (2D denoiser: per view).
@@ -123,10 +129,11 @@ class MotionDraws:
         coordinates = {
             "chain": np.arange(shape[0]),
             "draw": np.arange(shape[1]),
+            "frame": np.arange(posterior.frames),
             "joint": list(skeleton.joint_names),
             "axis": ["x", "y", "z"],
         }
-        return cls(xr.Dataset(data, coordinates, attributes))
+        return cls(xr.Dataset(data, coordinates, attributes), posterior.likelihood)
 
     @property
     def positions(self) -> xr.DataArray:
@@ -196,16 +203,24 @@ class MotionDraws:
             for draw in range(self.dataset.sizes["draw"]):
                 yield self.motion(draw, chain)
 
-    def to_arviz(self) -> xr.DataTree:
-        """Return an ArviZ tree: ``posterior`` (positions, theta) and ``sample_stats``."""
-        variables = [name for name in ("positions", "theta") if name in self.dataset]
-        statistics = {
-            ("lp" if name == "log_density" else str(name)): values
-            for name, values in self.dataset.data_vars.items()
-            if values.dims[:1] == ("chain",) and name not in variables
-        }
-        posterior = self.dataset[variables].assign_attrs(self.dataset.attrs)
-        groups = {"posterior": posterior, "sample_stats": xr.Dataset(statistics)}
+    def to_arviz(self, likelihood: Likelihood | None = None) -> xr.DataTree:
+        """Return an ArviZ tree.
+
+        The groups are ``posterior`` (positions, theta), ``sample_stats`` (``lp``,
+        ``acceptance_rate``, ``diverging``, ``n_steps``, ``energy``, as far as the sampler has
+        them), and, for :class:`~probmotion.Keypoints2D` and :class:`~probmotion.Joints3D`,
+        ``log_likelihood`` and ``observed_data`` over the ``observation`` of visible entries, which
+        has the coordinates ``view``, ``frame`` and ``joint``.
+
+        Parameters
+        ----------
+        likelihood : Likelihood, optional
+            Likelihood of draws loaded from a file; by default that of the sampled posterior.
+        """
+        likelihood = self.likelihood if likelihood is None else likelihood
+        groups = posterior_groups(self.dataset)
+        if likelihood is not None:
+            groups |= observation_groups(likelihood, self.positions)
         return xr.DataTree.from_dict(groups)
 
     def citations(self) -> list[str]:

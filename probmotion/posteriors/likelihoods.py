@@ -82,17 +82,25 @@ class EntryNoise:
         xp = array_namespace(residual)
         n_seen = residual.shape[-1] * int(self.visible.sum())
         log_scale = residual.shape[-1] * 0.5 * float(np.log(self.precision[self.visible]).sum())
+        terms, normaliser = self._terms(residual)
+        axes = tuple(range(-1 - self.confidence.ndim, 0))
+        return xp.sum(terms, axis=axes) + (log_scale + n_seen * normaliser)
+
+    def pointwise_log_density(self, residual: np.ndarray) -> np.ndarray:
+        """Return log p(residual) per visible entry: ``(…, *confidence.shape, M) → (…, n)``."""
+        terms, normaliser = self._terms(residual)
+        log_scale = 0.5 * np.log(self.precision[self.visible])
+        return terms.sum(axis=-1)[..., self.visible] + residual.shape[-1] * (log_scale + normaliser)
+
+    def _terms(self, residual: Array) -> tuple[Array, float]:
+        """Return the log density of each number up to scale, and its normaliser."""
         square = residual**2 * constant(self.precision[..., None], residual)
         nu = self.degrees_of_freedom
         if nu is None:
-            normaliser = -0.5 * math.log(2 * math.pi)
-            terms = -0.5 * square
-        else:
-            gammas = math.lgamma((nu + 1) / 2) - math.lgamma(nu / 2)
-            normaliser = gammas - 0.5 * math.log(nu * math.pi)
-            terms = -0.5 * (nu + 1) * xp.log1p(square / nu)
-        axes = tuple(range(-1 - self.confidence.ndim, 0))
-        return xp.sum(terms, axis=axes) + (log_scale + n_seen * normaliser)
+            return -0.5 * square, -0.5 * math.log(2 * math.pi)
+        gammas = math.lgamma((nu + 1) / 2) - math.lgamma(nu / 2)
+        log1p = array_namespace(residual).log1p
+        return -0.5 * (nu + 1) * log1p(square / nu), gammas - 0.5 * math.log(nu * math.pi)
 
     def draw(self, rng: np.random.Generator, size: int) -> np.ndarray:
         """Return noise of shape ``(*confidence.shape, size)``; 0 where occluded."""
@@ -126,6 +134,23 @@ class _Entries:
     def n_joints(self) -> int:
         """Number of joints J."""
         return self.entries.confidence.shape[-1]
+
+    def log_density(self, positions: Array) -> Array:
+        """Return log p(y | X): ``(…, L, J, 3) → (…)``."""
+        check_shape("positions", positions, ("…", self.frames, self.n_joints, 3))
+        return self.entries.log_density(self._residual(positions))
+
+    def pointwise_log_density(self, positions: np.ndarray) -> np.ndarray:
+        """Return log p(yᵢ | X) of every visible entry: ``(…, L, J, 3) → (…, n)``.
+
+        The entries are in the order of ``entries.visible``.
+        """
+        check_shape("positions", positions, ("…", self.frames, self.n_joints, 3))
+        return self.entries.pointwise_log_density(self._residual(positions))
+
+    def _residual(self, positions: Array) -> Array:
+        """Return observed minus predicted values, ``(…, L, J, 3) → (…, *entries, M)``."""
+        raise NotImplementedError
 
     def _set_entries(self, name: str, shape: tuple[int | str, ...]) -> None:
         """Validate the observed array ``name``; store it, its confidence and its noise."""
@@ -202,11 +227,8 @@ class Keypoints2D(_Entries):
         points, confidence = track.keypoints[None], track.confidence[None]
         return cls(points, camera, noise, confidence, None, track.skeleton, track.fps)
 
-    def log_density(self, positions: Array) -> Array:
-        """Return log p(y | X): ``(…, L, J, 3) → (…)``."""
-        check_shape("positions", positions, ("…", self.frames, self.n_joints, 3))
-        residual = constant(self.keypoints, positions) - self.cameras.project(positions)
-        return self.entries.log_density(residual)
+    def _residual(self, positions: Array) -> Array:
+        return constant(self.keypoints, positions) - self.cameras.project(positions)
 
     def simulate(self, rng: np.random.Generator, positions: np.ndarray) -> Keypoints2D:
         """Return the likelihood of observations drawn from p(y | X), X of shape (L, J, 3)."""
@@ -267,10 +289,8 @@ class Joints3D(_Entries):
         blank = cls(zeros, noise, _confidence_of(hidden, shape), degrees_of_freedom, *source)
         return blank.simulate(seeds.generator(seed, "evidence"), motion.positions)
 
-    def log_density(self, positions: Array) -> Array:
-        """Return log p(y | X): ``(…, L, J, 3) → (…)``."""
-        check_shape("positions", positions, ("…", self.frames, self.n_joints, 3))
-        return self.entries.log_density(constant(self.joints, positions) - positions)
+    def _residual(self, positions: Array) -> Array:
+        return constant(self.joints, positions) - positions
 
     def simulate(self, rng: np.random.Generator, positions: np.ndarray) -> Joints3D:
         """Return the likelihood of observations drawn from p(y | X), X of shape (L, J, 3)."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from probmotion import seeds
 from probmotion.arrays import Array, to_numpy
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.protocols import (
@@ -234,16 +235,19 @@ class MotionPosterior:
         check_shape("theta", theta, ("…", self.dim))
         return self.prior.motion(theta)
 
-    def complete(self, rng: RandomNumbers, theta: np.ndarray) -> np.ndarray:
-        """Return one motion per θ, ``(n, dim) → (n, L, J, 3)``.
+    def complete(self, theta: Array, rng: RandomNumbers | None = None) -> np.ndarray:
+        """Return one motion per θ: ``(…, dim) → (…, L, J, 3)``, metres.
 
-        Variables that the prior marginalises are drawn given θ and the observations; ``rng`` is
-        unused without such variables.
+        Variables that the prior marginalises are drawn given θ and the observations, from ``rng``
+        or, by default, a generator of seed 0. ``rng`` is unused without such variables.
         """
-        check_shape("theta", theta, ("n", self.dim))
-        if isinstance(self.prior, Marginalises):
-            return self.prior.complete(rng, theta, self.likelihood)
-        return to_numpy(self.prior.motion(theta))
+        check_shape("theta", theta, ("…", self.dim))
+        if not isinstance(self.prior, Marginalises):
+            return to_numpy(self.prior.motion(theta))
+        rng = seeds.generator(0, "complete") if rng is None else rng
+        flat = to_numpy(theta).reshape(-1, self.dim)
+        motions = self.prior.complete(rng, flat, self.likelihood)
+        return motions.reshape(*theta.shape[:-1], *motions.shape[1:])
 
     def initial(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """Return n starting points drawn from the prior, (n, dim)."""

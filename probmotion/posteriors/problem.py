@@ -21,7 +21,7 @@ from probmotion.posteriors.protocols import (
 from probmotion.posteriors.reference import HasPositionDensity, StoredReference, log_density_at
 from probmotion.validation import check_count, check_finite, check_shape
 
-__all__ = ["Problem", "simulated"]
+__all__ = ["Problem", "problem_of", "simulated"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +145,13 @@ def simulated(problem: Problem) -> Problem:
     The prior must be :class:`~probmotion.posteriors.protocols.Samplable`.
     """
     return replace(problem, simulate=partial(_another, problem))
+
+
+def problem_of(name: str, posterior: MotionPosterior) -> Problem:
+    """Return the problem of a user-supplied posterior, simulated if its prior can be sampled."""
+    problem = Problem(name, "a user-supplied posterior", posterior)
+    can_simulate = isinstance(posterior.prior, Samplable) and not posterior.truncated
+    return simulated(problem) if can_simulate else problem
 
 
 def _another(problem: Problem, k: int) -> Problem:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, get_args, runtime_che
 import numpy as np
 
 from probmotion.posteriors.posterior import MotionPosterior
+from probmotion.validation import did_you_mean
 
 if TYPE_CHECKING:
     from probmotion.posteriors.draws import MotionDraws
@@ -39,7 +40,10 @@ class Sampler(Protocol):
     implement; a union ``A | B`` requires A or B.
     """
 
-    name: ClassVar[str]
+    @property
+    def name(self) -> str:
+        """Name in tables."""
+
     # Any permits samplers to annotate tuple[type, ...] if they use no unions.
     requires: ClassVar[tuple[Any, ...]]
 
@@ -179,7 +183,8 @@ def load_sampler(name: str) -> type[Any]:
     """Return the class of a registered sampler; raise ``ValueError`` if it cannot be imported."""
     known = _registered()
     if name not in known:
-        raise ValueError(f"sampler must be one of {', '.join(sorted(known))}, got {name!r}")
+        hint = did_you_mean(name, known)
+        raise ValueError(f"sampler must be one of {', '.join(sorted(known))}, got {name!r}{hint}")
     point = known[name]
     try:
         return point.load()

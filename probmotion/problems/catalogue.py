@@ -17,6 +17,7 @@ from probmotion.problems.learnt import LEARNT_PROBLEMS
 from probmotion.problems.pairs import PAIR_PROBLEMS
 from probmotion.problems.references.store import find_reference
 from probmotion.threads import one_thread
+from probmotion.validation import did_you_mean
 
 __all__ = [
     "available_problems",
@@ -89,7 +90,10 @@ def _resolve(name: str, scale: dict[str, Any]) -> tuple[str, Scale]:
     if scaled := _SCALED.fullmatch(name):
         name, scale = scaled["name"], _parse(scaled["scale"]) | scale
     if name not in problem_names():
-        raise ValueError(f"problem must be one of {', '.join(problem_names())}, got {name!r}")
+        known = problem_names()
+        raise ValueError(
+            f"problem must be one of {', '.join(known)}, got {name!r}{did_you_mean(name, known)}"
+        )
     defaults = _GAITS[name].defaults if name in _GAITS else {}
     for key, value in scale.items():
         if key not in defaults:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from html import escape
 from typing import TYPE_CHECKING
 
@@ -11,47 +10,41 @@ from probmotion.comparison.results.table import ComparisonTable
 if TYPE_CHECKING:
     from probmotion.comparison.results.grid_results import GridResults
 
-__all__ = ["contents", "facts", "note_ids", "notes", "reading_guide"]
+__all__ = ["facts", "heading", "note_ids", "notes", "reading_guide"]
+
+_MAX_NAMED = 3  # Maximum number of problems in the title.
+_PACKAGES = ("probmotion", "numpy", "torch")
+
+
+def heading(comparison: GridResults) -> str:
+    """Return the title of the report as text."""
+    problems = list(comparison.plan.problems)
+    is_short = len(problems) <= _MAX_NAMED
+    return f"probmotion · {', '.join(problems) if is_short else f'{len(problems)} problems'}"
 
 
 def facts(comparison: GridResults) -> str:
-    """Return problems, samplers, numbers of draws and library versions as an HTML list."""
+    """Return date, machine, budget, seeds, versions and command as an HTML list."""
     plan = comparison.plan
-    failed = len(comparison.failures)
     total = len(plan.problems) * len(plan.samplers) * plan.seeds
-    entries = {
-        "problems": ", ".join(plan.problems),
-        "samplers": ", ".join(plan.samplers),
-        "draws": f"{plan.draws} per sampler, on {plan.chains} chain{'s' * (plan.chains != 1)}",
-        "seeds": f"{plan.seeds}; numbers are mean ± standard deviation"
-        if plan.seeds > 1
-        else "1; without standard deviations",
-        "runs": f"{len(comparison.results)} of {total} finished, {failed} of them without draws",
-        "versions": _versions(comparison),
-    }
-    listed = "".join(
-        f"<dt>{name}</dt><dd>{escape(text)}</dd>" for name, text in entries.items() if text
-    )
-    return f'<dl class="facts">{listed}</dl>'
-
-
-def _versions(comparison: GridResults) -> str:
-    """Return the library versions of the first draws; empty if every run failed."""
-    for result in comparison.results:
-        if result.failure is None:
-            draws = comparison.draws(result.problem, result.sampler, result.seed)
-            versions = json.loads(draws.dataset.attrs["versions"])
-            return ", ".join(f"{name} {number}" for name, number in versions.items())
-    return ""
-
-
-def contents(comparison: GridResults, with_calibration: bool) -> str:
-    """Return links to all sections as HTML."""
-    links = [(f"problem-{i}", name) for i, name in enumerate(comparison.plan.problems)]
-    links += [("calibration", "calibration")] if with_calibration else []
-    links.append(("notes", "notes"))
-    items = "".join(f'<li><a href="#{anchor}">{escape(name)}</a></li>' for anchor, name in links)
-    return f'<nav aria-label="Sections"><ul>{items}</ul></nav>'
+    finished = len(comparison.results)
+    chains = f" on {plan.chains} chains" if plan.chains > 1 else ""
+    entries = [
+        plan.date,
+        plan.machine,
+        f"{plan.draws} draws{chains}",
+        plan.budget,
+        "seed 0" if plan.seeds == 1 else f"seeds 0–{plan.seeds - 1}",
+        ", ".join(f"{name} {plan.versions[name]}" for name in _PACKAGES if name in plan.versions),
+        f"{finished} of {total} runs finished" if finished < total else "",
+    ]
+    items = "".join(f"<li>{escape(text)}</li>" for text in entries if text)
+    if plan.command:
+        items += (
+            f'<li class="command"><code title="{escape(plan.command)}">{escape(plan.command)}'
+            '</code> <button type="button" data-does="copy">copy</button></li>'
+        )
+    return f'<ul class="facts">{items}</ul>'
 
 
 def reading_guide(comparison: GridResults, table: ComparisonTable) -> str:
@@ -65,7 +58,11 @@ def reading_guide(comparison: GridResults, table: ComparisonTable) -> str:
         "over seeds contain 0."
     )
     return f"""\
-<details open><summary>How to read this report</summary>
+<details><summary>How to read this report</summary>
+<p>A sampler is right (●) if every quantity is shown to lie within its tolerance of the reference
+draws, wrong (▲) if one is shown to differ and its estimate is outside, and otherwise undecided (○).
+Hover over a verdict, or select it, for the numbers. ✕: no draws; –: no reference draws, or not
+supported.</p>
 {legends}
 <p>{highlights}</p>
 <p>Click a column heading to sort by it, in ascending, then in descending order. –: not
@@ -97,7 +94,7 @@ def notes(comparison: GridResults) -> str:
     )
     listed = f'<ul class="notes">{items}</ul>' if items else "<p>No notes.</p>"
     return f"""\
-<section id="notes" aria-labelledby="notes-name">
+<section class="part" id="notes" aria-labelledby="notes-name">
 <header><h2 id="notes-name">Notes</h2></header>
 {listed}
 </section>"""

@@ -19,13 +19,14 @@ import pandas as pd
 from probmotion.comparison.results.headline_metrics import headline_metric
 from probmotion.comparison.results.table import ComparisonTable
 from probmotion.files import written_whole
+from probmotion.metrics.verdict import Verdict
 from probmotion.plots.animation import animation_script, animation_style
 from probmotion.plots.motion_data import Shown
 from probmotion.plots.quality import plot_quality_against_cost, quality_points
-from probmotion.plots.style import CYCLE
-from probmotion.report.animations import BUDGET, animation, shown_problems
-from probmotion.report.header import contents, facts, note_ids, notes, reading_guide
-from probmotion.report.tables import Outcome, overview, problem_tables
+from probmotion.report.animations import BUDGET, animation, featured_problem, shown_problems
+from probmotion.report.first_screen import first_screen
+from probmotion.report.header import facts, heading, note_ids, notes, reading_guide
+from probmotion.report.tables import Outcome, problem_tables
 
 if TYPE_CHECKING:
     from probmotion.calibration.result import Calibration
@@ -33,11 +34,6 @@ if TYPE_CHECKING:
 
 __all__ = ["write_report"]
 
-_ON_DARK = (
-    "#FFFFFF", "#5BB3E8", "#F58A4B", "#2FC79B", "#E39BC2", "#DDA92E", "#9CD0F5", "#C2A27E",
-    "#A8A8A8",
-)  # fmt: skip
-"""Variants of the colours in CYCLE for dark backgrounds."""
 _LEAST = BUDGET // 9
 """Minimum budget for motions in bytes, whatever the size of the figures."""
 
@@ -74,7 +70,8 @@ def write_report(
 
 def _page(comparison: GridResults, calibration: Calibration | None) -> str:
     plan, table = comparison.plan, comparison.table()
-    plots = {name: _quality_plot(table, name) for name in plan.problems}
+    verdicts = comparison.verdicts()
+    plots = {name: _quality_plot(table, name, verdicts[name]) for name in plan.problems}
     ranks = b"" if calibration is None or not calibration.ranked else _png(calibration.plot)
     size = len(ranks) + sum(map(len, plots.values()))
     shown = shown_problems(comparison, max(_LEAST, BUDGET - size))
@@ -83,16 +80,15 @@ def _page(comparison: GridResults, calibration: Calibration | None) -> str:
         name: {sampler: _outcome(comparison, name, sampler, ids) for sampler in plan.samplers}
         for name in plan.problems
     }
+    images = {name: _quality_image(name, plot) for name, plot in plots.items()}
+    featured = images.pop(featured_problem(comparison))
     sections = [
-        _section(comparison, table, name, i, shown.get(name), outcomes[name], plots[name])
+        _section(comparison, table, name, i, shown.get(name), outcomes[name], images.get(name, ""))
         for i, name in enumerate(plan.problems)
     ]
     if calibration is not None:
         sections.append(_calibration(calibration, ranks))
-    count = len(plan.samplers), len(plan.problems)
-    title = " on ".join(
-        f"{n} {kind}{'s' * (n != 1)}" for n, kind in zip(count, ("sampler", "problem"), strict=True)
-    )
+    title = escape(heading(comparison))
     # The policy blocks external resources.
     policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; "
     policy += "script-src 'unsafe-inline'"
@@ -103,22 +99,24 @@ def _page(comparison: GridResults, calibration: Calibration | None) -> str:
 <meta charset="utf-8">
 <meta http-equiv="Content-Security-Policy" content="{policy}">
 <meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title} — comparison</title>
+<title>{title}</title>
 <style>
-{animation_style()}{_text("page.css")}{_sampler_colours()}</style>
+{animation_style()}{_text("page.css")}</style>
 </head>
 <body>
 <main>
+<header class="top">
 <h1>{title}</h1>
 {facts(comparison)}
-{contents(comparison, calibration is not None)}
-{reading_guide(comparison, table)}
-{overview(plan, table, outcomes)}
+</header>
+{first_screen(comparison, verdicts, outcomes, featured)}
 {chr(10).join(sections)}
 {notes(comparison)}
+{reading_guide(comparison, table)}
 </main>
 <script>
 document.querySelectorAll("table").forEach({_text("tables.js")});
+document.querySelectorAll("[data-does=copy]").forEach({_text("copy.js")});
 document.querySelectorAll(".animation").forEach({animation_script()});
 </script>
 </body>
@@ -133,7 +131,7 @@ def _section(
     place: int,
     shown: Shown | None,
     outcomes: Mapping[str, Outcome],
-    plot: bytes,
+    image: str,
 ) -> str:
     draws = '<p class="quiet">No draws are available.</p>'
     if shown is not None:
@@ -144,11 +142,11 @@ def _section(
         }
         draws = animation(name, shown, place, missing)
     return f"""\
-<section id="problem-{place}" aria-labelledby="problem-{place}-name">
+<section class="part" id="problem-{place}" aria-labelledby="problem-{place}-name">
 <header><h2 id="problem-{place}-name">{escape(name)}</h2></header>
 <p>{escape(comparison.plan.problems[name])}</p>
 {problem_tables(table, name, list(outcomes), outcomes)}
-{_image(plot, f"Quality against cost on {name}; the tables contain the numbers.")}
+{image}
 <h3 id="skeletons-{place}">Draws on {escape(name)}</h3>
 {draws}
 </section>"""
@@ -172,17 +170,23 @@ def _outcome(
         note=ids.get((problem, sampler), "notes"),
         failed=len(failures) + missing,
         seeds=seeds,
+        unsupported=bool(failures) and all(failure.unsupported for failure in failures),
     )
 
 
-def _quality_plot(table: ComparisonTable, problem: str) -> bytes:
+def _quality_plot(table: ComparisonTable, problem: str, verdicts: Mapping[str, Verdict]) -> bytes:
     """Return the plot of quality against cost as a PNG file; empty if no sampler has a point."""
     rows = pd.DataFrame(table[table["problem"] == problem])
     rows.attrs = table.attrs
     quality = headline_metric(rows)
     if quality is None or not quality_points(rows, quality):
         return b""
-    return _png(lambda path: plot_quality_against_cost(rows, path))
+    judged = {problem: verdicts} if verdicts else None
+    return _png(lambda path: plot_quality_against_cost(rows, path, verdicts=judged))
+
+
+def _quality_image(problem: str, plot: bytes) -> str:
+    return _image(plot, f"Quality against cost on {problem}; the tables contain the numbers.")
 
 
 def _png(plot: Callable[[Path], object]) -> bytes:
@@ -215,7 +219,7 @@ def _calibration(calibration: Calibration, figure: bytes) -> str:
     if not figure:
         shown = "<p>No sampler has ranks; the table contains the reasons.</p>"
     return f"""\
-<section id="calibration" aria-labelledby="calibration-name">
+<section class="part" id="calibration" aria-labelledby="calibration-name">
 <header><h2 id="calibration-name">Calibration</h2></header>
 <p>Truths are drawn from the prior and observations are simulated from them. For a calibrated
 sampler the rank of a truth among the draws is uniform, and credible sets have nominal coverage.</p>
@@ -223,19 +227,6 @@ sampler the rank of a truth among the draws is uniform, and credible sets have n
 <details><summary>Table</summary><pre tabindex="0">{escape(str(calibration.table()))}</pre>
 </details>
 </section>"""
-
-
-def _sampler_colours() -> str:
-    """Return the colours of samplers as CSS, for light and dark backgrounds."""
-    light, dark = (
-        "".join(f"--sampler-{i}: {colour}; " for i, colour in enumerate(cycle))
-        for cycle in (CYCLE, _ON_DARK)
-    )
-    classes = "".join(f".sampler-{i} {{ fill: var(--sampler-{i}); }}\n" for i in range(len(CYCLE)))
-    return (
-        f":root {{ {light}}}\n"
-        f"@media screen and (prefers-color-scheme: dark) {{ :root {{ {dark}}} }}\n{classes}"
-    )
 
 
 def _text(name: str) -> str:

@@ -1,4 +1,4 @@
-"""Sortable tables of the report: an overview, and one per problem and group of metrics."""
+"""Sortable tables of a problem, one per group of metrics."""
 
 from __future__ import annotations
 
@@ -6,23 +6,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from probmotion.comparison.results.headline_metrics import (
-    HEADLINE_METRICS,
-    best_of,
-    headline_metric,
-    seed_values,
-)
+from probmotion.comparison.results.headline_metrics import best_of, seed_values
 from probmotion.comparison.results.table import BLOCKS, mean_and_sd
-from probmotion.plots.style import CYCLE, style_of
+from probmotion.plots.style import sampler_style
 
-if TYPE_CHECKING:
-    from probmotion.comparison.results.plan import Plan
-
-__all__ = ["Outcome", "overview", "problem_tables"]
+__all__ = ["Outcome", "problem_tables", "sampler_name"]
 
 _FAILURES = ("unsupported", "failed")  # Metrics that mark runs without draws.
 _MARKERS = {
@@ -37,7 +28,7 @@ _MARKERS = {
     "<": "M-6 0L4.5-5.5v11z",
     ">": "M6 0L-4.5-5.5v11z",
 }
-"""SVG paths of the markers of :func:`~probmotion.plots.style.style_of`."""
+"""SVG paths of the markers of :func:`~probmotion.plots.style.sampler_style`."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +36,8 @@ class Outcome:
     """Number of seeds without draws of a sampler on a problem, and the reason.
 
     ``word`` is the short reason, ``sentences`` the long reason, and ``note`` the HTML id of the
-    note with the reason. ``failed`` of the ``seeds`` runs have no draws.
+    note with the reason. ``failed`` of the ``seeds`` runs have no draws; if ``unsupported``,
+    because the sampler does not support the problem.
     """
 
     word: str = ""
@@ -53,49 +45,12 @@ class Outcome:
     note: str = ""
     failed: int = 0
     seeds: int = 1
+    unsupported: bool = False
 
     def link(self) -> str:
         """Return the word as a link to the note, with the sentences as its title."""
         title = escape(self.sentences)
         return f'<a href="#{self.note}" title="{title}">{escape(self.word)}</a>'
-
-
-def overview(plan: Plan, table: pd.DataFrame, outcomes: Mapping[str, Mapping[str, Outcome]]) -> str:
-    """Return the headline metrics of all problems and samplers as an HTML table.
-
-    The result is empty for a single problem. ``outcomes`` are indexed by problem and sampler.
-    """
-    if len(plan.problems) < 2:
-        return ""
-    header = "".join(
-        f'<th scope="col">{_name(place, sampler)}</th>'
-        for place, sampler in enumerate(plan.samplers)
-    )
-    rows, used = [], set()
-    for place, problem in enumerate(plan.problems):
-        measured = table[table["problem"] == problem]
-        metric = headline_metric(measured) or "–"
-        used.add(metric)
-        headline = seed_values(measured[measured["metric"] == metric])
-        values = {name: row for (name, _), row in headline.items()}
-        best = best_of(metric, values, range(plan.seeds))
-        entries = "".join(
-            f'<td class="failed">{outcome.link()}</td>'
-            if outcome.failed == outcome.seeds
-            else _value(values.get(sampler), sampler, best)
-            for sampler, outcome in outcomes[problem].items()
-        )
-        link = f'<a href="#problem-{place}">{escape(problem)}</a>'
-        rows.append(f'<tr><th scope="row">{link}</th><td>{escape(metric)}</td>{entries}</tr>')
-    legend = "; ".join(f"{name}: {text}" for name, text in HEADLINE_METRICS.items() if name in used)
-    return f"""\
-<div class="scroll" tabindex="0" role="region" aria-label="overview"><table class="overview">
-<caption>headline metric of every sampler on every problem</caption>
-<thead><tr><th scope="col">problem</th><th scope="col">metric</th>{header}</tr></thead>
-<tbody>
-{chr(10).join(rows)}
-</tbody></table></div>
-<p class="quiet">{escape(legend)}</p>"""
 
 
 def problem_tables(
@@ -135,11 +90,11 @@ def _table(
         by_sampler = {name: values[name, metric] for name in samplers if (name, metric) in values}
         best[metric] = best_of(metric, by_sampler, seeds, {other for _, other in values}, draws)
     body = []
-    for place, sampler in enumerate(samplers):
+    for sampler in samplers:
         outcome = outcomes[sampler]
         partial = f" ({outcome.seeds - outcome.failed} of {outcome.seeds} seeds; {outcome.link()})"
         name = (
-            f'<th scope="row" data-value="{escape(sampler)}">{_name(place, sampler)}'
+            f'<th scope="row" data-value="{escape(sampler)}">{sampler_name(sampler)}'
             f"{partial if 0 < outcome.failed < outcome.seeds else ''}</th>"
         )
         if outcome.failed == outcome.seeds:
@@ -163,12 +118,12 @@ def _table(
 </tbody></table></div>"""
 
 
-def _name(place: int, sampler: str) -> str:
+def sampler_name(sampler: str) -> str:
     """Return a sampler's marker and name as HTML."""
-    path = f'<path class="sampler-{place % len(CYCLE)}" d="{_MARKERS[style_of(place)[1]]}"/>'
+    style = sampler_style(sampler)
     return (
-        f'<svg viewBox="-8 -8 16 16" width="12" height="12" aria-hidden="true">{path}</svg> '
-        f"{escape(sampler)}"
+        '<svg class="marker" viewBox="-8 -8 16 16" width="12" height="12" aria-hidden="true">'
+        f'<path fill="{style.colour}" d="{_MARKERS[style.marker]}"/></svg> {escape(sampler)}'
     )
 
 

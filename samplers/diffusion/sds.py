@@ -170,7 +170,7 @@ class ScoreDistillation(IndependentSampler):
             counts["gradient"] += len(theta) * self.iterations * observed
             counts["density"] += len(theta)
             thetas.append(theta)
-            return posterior.complete(streams, theta)
+            return posterior.complete(theta, streams)
 
         return Batches(draw, self.batch, self.iterations, counts=counts, thetas=thetas)
 

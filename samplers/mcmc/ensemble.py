@@ -255,7 +255,7 @@ class _Run:
         times = np.maximum(slowest * self._stride / self.thin, 1.0)
         too_short = len(self.trace) < _MIN_RUN_LENGTH * slowest
         times = np.where(too_short, np.maximum(times, len(self.recorded)), times)
-        return {"acceptance": accepted.mean(axis=(0, 2)), "autocorrelation_time": times}
+        return {"acceptance_rate": accepted.mean(axis=(0, 2)), "autocorrelation_time": times}
 
     @property
     def _stride(self) -> int:

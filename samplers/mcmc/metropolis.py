@@ -143,7 +143,10 @@ class MetropolisHastings:
             seconds=time.perf_counter() - start,
             theta=theta,
             log_density=log_density,
-            statistics={"acceptance": acceptance, **posterior.draw_statistics(theta, log_density)},
+            statistics={
+                "acceptance_rate": acceptance,
+                **posterior.draw_statistics(theta, log_density),
+            },
             counts={"density": density.evaluations},
             state=state,
         )

@@ -40,8 +40,9 @@ class NUTS:
     max_tree_depth : int
         Maximum number of trajectory doublings (at most 2^max_tree_depth − 1 steps).
     thin : int
-        Number of iterations per draw. Statistics of a draw are their mean ``acceptance``, whether
-        any was ``divergent``, and their total number of leapfrog ``steps``.
+        Number of iterations per draw. Statistics of a draw are their mean ``acceptance_rate``,
+        whether any was ``diverging``, their total number of leapfrog steps, ``n_steps``, and the
+        ``energy`` of the last.
     candidates : int
         Number of prior draws per chain; the starting point is resampled from them by likelihood.
 
@@ -209,7 +210,7 @@ class _Run:
     def _advance(self, state: Any, draws: int, thin: int) -> tuple[Any, dict[str, np.ndarray]]:
         state, rows = self.kernel.advance(state, draws, thin)
         finished = {name: np.asarray(values)[:draws] for name, values in rows.items()}
-        self.gradients += int(finished["steps"].sum())
+        self.gradients += int(finished["n_steps"].sum())
         return state, finished
 
 

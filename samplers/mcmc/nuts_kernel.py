@@ -113,32 +113,34 @@ class NutsKernel:
         import jax.numpy as jnp
 
         def iteration(_: Any, carry: tuple[Any, Any, Any, Any]) -> Any:
-            state, accepted, divergent, steps = carry
+            state, accepted, diverging, steps = carry
             state = self.kernel.sample(state, (), {})
-            divergent = divergent | state.diverging
-            return state, accepted + state.accept_prob, divergent, steps + state.num_steps
+            diverging = diverging | state.diverging
+            return state, accepted + state.accept_prob, diverging, steps + state.num_steps
 
         def draw(i: Any, carry: tuple[Any, dict[str, Any]]) -> Any:
             state, rows = carry
             zeros = (jnp.zeros(()), jnp.zeros((), bool), jnp.zeros((), jnp.int64))
-            state, accepted, divergent, steps = jax.lax.fori_loop(
+            state, accepted, diverging, steps = jax.lax.fori_loop(
                 0, thin, iteration, (state, *zeros)
             )
             values = {
                 "theta": state.z,
                 "log_density": -state.potential_energy,
-                "acceptance": accepted / thin,
-                "divergent": divergent,
-                "steps": steps,
+                "acceptance_rate": accepted / thin,
+                "diverging": diverging,
+                "n_steps": steps,
+                "energy": state.energy,
             }
             return state, {name: rows[name].at[i].set(value) for name, value in values.items()}
 
         empty = {
             "theta": jnp.zeros((CHUNK, *state.z.shape)),
             "log_density": jnp.zeros(CHUNK),
-            "acceptance": jnp.zeros(CHUNK),
-            "divergent": jnp.zeros(CHUNK, bool),
-            "steps": jnp.zeros(CHUNK, jnp.int64),
+            "acceptance_rate": jnp.zeros(CHUNK),
+            "diverging": jnp.zeros(CHUNK, bool),
+            "n_steps": jnp.zeros(CHUNK, jnp.int64),
+            "energy": jnp.zeros(CHUNK),
         }
         return jax.lax.fori_loop(0, draws, draw, (state, empty))
 

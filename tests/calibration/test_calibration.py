@@ -69,7 +69,7 @@ class Batch:
             seconds=1.5,
             theta=np.zeros((chains, draws, posterior.dim)),
             log_density=np.zeros((chains, draws)),
-            statistics={"acceptance": np.full((chains, draws), 0.25)},
+            statistics={"acceptance_rate": np.full((chains, draws), 0.25)},
             counts={"density": 7 * self.thin},
             independent=True,
         )
@@ -283,7 +283,7 @@ def test_resuming_and_extending(tmp_path):
     for name, ranks in other.ranks("toy", "batch").items():
         np.testing.assert_array_equal(ranks, more.ranks("toy", "batch")[name])
         np.testing.assert_array_equal(ranks[:10], first.ranks("toy", "batch")[name])
-    with pytest.raises(ValueError, match="other settings"):
+    with pytest.raises(ValueError, match="contains finished runs with"):
         once(simulations=10, out=tmp_path / "kept", draws=20)
 
 
@@ -301,7 +301,7 @@ def test_the_budget_is_the_same_for_all_simulations(tmp_path):
     expected = calibrate(toy(), replace(sampler, thin=50), simulations=10, **SMALL)
     for name, ranks in expected.ranks("toy", "batch").items():
         np.testing.assert_array_equal(result.ranks("toy", "batch")[name], ranks)
-    with pytest.raises(ValueError, match="other settings"):
+    with pytest.raises(ValueError, match="contains finished runs with"):
         once(simulations=12, budget=Budget(evaluations=700))
 
 
@@ -315,10 +315,22 @@ def test_draws_are_not_stored_and_temporary_folders_are_removed():
     assert not folder.parent.exists()
 
 
+def test_posteriors_are_simulated_from_their_prior():
+    results = [
+        calibrate({"toy": target}, Batch(), simulations=10, **SMALL)
+        for target in (toy(), toy().posterior)
+    ]
+    first, second = (result.ranks("toy", "batch") for result in results)
+    assert first.keys() == second.keys()
+    for name, ranks in first.items():
+        np.testing.assert_array_equal(ranks, second[name])
+
+
 @pytest.mark.parametrize(
     ("problem", "options", "message"),
     [
         (unsimulated, {}, "problems must have simulate, got 'toy' without"),
+        (toy, {"samplers": np.zeros((2, 3))}, "must sample every simulation, got finished draws"),
         (toy, {"simulations": 3}, "simulations must be an integer of at least 10, got 3"),
         (toy, {"draws": 41}, "draws must be a multiple of chains, 2, got 41"),
         (toy, {"budget": 350}, "budget must be a Budget, got 350"),
@@ -326,7 +338,7 @@ def test_draws_are_not_stored_and_temporary_folders_are_removed():
 )
 def test_invalid_arguments(problem, options, message):
     with pytest.raises(ValueError, match=message):
-        calibrate(problem(), Batch(), **(SMALL | {"simulations": 10} | options))
+        calibrate(problem(), **({"samplers": Batch(), "simulations": 10} | SMALL | options))
     for factor in (0, 1, math.nan):
         with pytest.raises(ValueError, match="factor must be"):
             Overconfident(Batch(), factor)
@@ -355,7 +367,7 @@ def test_the_negative_control_shrinks_draws_towards_their_mean():
     assert wrong.dataset.attrs["sampler"] == "overconfident"
     assert wrong.counts == {"density": 7}
     assert wrong.independent
-    assert (wrong.dataset["acceptance"] == 0.25).all()
+    assert (wrong.dataset["acceptance_rate"] == 0.25).all()
     assert not {"log_density", "theta"} & set(wrong.dataset)
     with pytest.raises(Interrupted) as stop:
         Overconfident(Stopped(), 0.25).sample(posterior, **options)

@@ -6,7 +6,8 @@ import resource
 import shutil
 import subprocess
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from itertools import pairwise
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -14,12 +15,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import probmotion
 from probmotion import MotionDraws, Skeleton
-from probmotion.cli.main import main
-from probmotion.cli.settings_options import object_from_text, text_of_object
+from probmotion.cli.main import _parse, main
+from probmotion.cli.settings_options import object_from_text, sampler_called, text_of_object
 from probmotion.data.synthetic.gaits import make_gait
 from probmotion.io.files import load, save
 from probmotion.models.training.checkpoints import WEIGHTS
+from probmotion.posteriors.sampling import importable_samplers
 
 PNG = b"\x89PNG"
 
@@ -41,21 +44,74 @@ def test_help_is_fast_and_loads_nothing_heavy():
     # CPU time, which does not depend on the load of the machine.
     assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 1.0
     assert run.returncode == 0
-    for command in ("compare", "which", "list", "show", "convert", "train", "reference"):
+    for command in ("compare", "report", "which", "list", "show", "convert", "train", "reference"):
         assert f"\n  {command} " in run.stdout
 
 
-@pytest.mark.parametrize("command", ["compare", "list", "show", "convert", "reference", "which"])
-def test_command_help(command, capsys):
+def test_version(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"probmotion {probmotion.__version__}\n"
+
+
+COMMANDS = ["compare", "report", "list", "show", "convert", "reference", "which"]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_command_help(command, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
     with pytest.raises(SystemExit) as end:
         main([command, "--help"])
     assert end.value.code == 0
     help_text = capsys.readouterr().out
     assert f"usage: probmotion {command}" in help_text
     assert not re.search(r"``|:[a-z]+:`", help_text)
-    options = ("--clips", "--prior", "--observe", "--workers", "--settings.mas.n-views")
-    for option in options if command == "compare" else ():
-        assert option in help_text
+    if command == "compare":
+        lines = help_text.splitlines()
+        assert len(lines) <= 80
+        assert max(map(len, lines)) <= 100
+        assert "--settings.mas" not in help_text
+        for words in ("--clips", "--prior", "--observe", "--workers", "probmotion show SAMPLER"):
+            assert words in help_text
+
+
+def test_every_setting_of_every_sampler_is_shown_and_accepted(capsys):
+    """Shown defaults are the defaults: passing them changes no sampler."""
+    words = []
+    for name, kind in importable_samplers().items():
+        assert main(["show", name]) == 0
+        lines = capsys.readouterr().out.splitlines()
+        assert lines[0].startswith(f"{name}: ")
+        shown = {}
+        for line, meaning in pairwise(lines):
+            if match := re.fullmatch(r"  (\S+) = (.+)  \((.+)\)", line):
+                assert meaning.strip(), f"{name}: {line}"
+                shown[match[1]] = match[2], match[3]
+        assert shown.keys() == {f.name.replace("_", "-") for f in fields(kind) if f.init}
+        for setting, (value, allowed) in shown.items():
+            if allowed == f"{setting} or no-{setting}":
+                words.append(f"--settings.{name}.{'' if value == 'True' else 'no-'}{setting}")
+            elif "in Python only" not in allowed:
+                words += [f"--settings.{name}.{setting}", value]
+    command = _parse("compare", ["gait", *words])
+    for name, kind in importable_samplers().items():
+        assert sampler_called(name, command.settings) == kind()
+
+
+def test_show_describes_presets_and_problems(capsys, tmp_path, monkeypatch):
+    assert main(["show", "mas.reference_code"]) == 0
+    shown = capsys.readouterr().out
+    assert "\n  n-views = 7  (int)\n" in shown
+    assert "--settings" not in shown
+    assert main(["show", "gait-monocular(frames=20)"]) == 0
+    shown = capsys.readouterr().out
+    assert "20 frames at 30 fps, 17 joints" in shown
+    assert re.search("samplers: .*exact.*nuts", shown)
+    # A file precedes a sampler of its name.
+    monkeypatch.chdir(tmp_path)
+    Path("mas").mkdir()
+    shutil.copy(WEIGHTS / "walk2d.safetensors", "mas/model.safetensors")
+    assert main(["show", "mas"]) == 0
+    assert "a motion-diffusion" in capsys.readouterr().out
 
 
 def test_list_prints_problems_samplers_presets_and_skeletons(capsys):
@@ -87,14 +143,14 @@ def test_compare_writes_the_table_and_passes_settings_to_presets_and_samplers(tm
     assert set(calls["value"]) == {20 * 3 * 5}
 
 
-def test_the_table_is_printed_before_figures_fail(tmp_path, capsys, monkeypatch):
+def test_the_summary_is_printed_before_figures_fail(tmp_path, capsys, monkeypatch):
     failing = Mock(side_effect=ValueError("invalid figure"))
     monkeypatch.setattr("probmotion.comparison.figures.draw_comparison", failing)
     words = f"compare gait --samplers exact --draws 12 --figures --workers 0 --out {tmp_path}"
     assert main(words.split()) == 2
     printed = capsys.readouterr()
     assert "invalid figure" in printed.err
-    assert "seconds" in printed.out
+    assert f"metrics: {tmp_path / 'table.txt'}, " in printed.out
 
 
 def test_compare_samples_a_user_prior(tmp_path):
@@ -123,7 +179,7 @@ def test_compare_fits_a_prior_to_user_clips_of_two_formats(tmp_path, write_walks
 
 @pytest.mark.parametrize(
     ("more", "budget", "draws"),
-    [("", "6 seconds per", 40), (" --draws 12 --evaluations 100", "100 evaluations", 12)],
+    [("", "6 seconds per", 200), (" --draws 12 --evaluations 100", "100 evaluations", 12)],
 )
 def test_quick_run_and_overrides(more, budget, draws, tmp_path, capsys):
     compare(tmp_path, "gait --samplers exact --quick" + more)
@@ -192,7 +248,9 @@ def test_show_finds_a_network_by_folder_or_name(tmp_path, capsys, monkeypatch, f
         printed = capsys.readouterr().out
         assert printed.startswith(f"{file}: a motion-diffusion of ")
         assert "14 joints, rooted at pelvis" in printed
-    assert fails("show", "walk3d") == "path must be an existing file, got walk3d"
+    message = fails("show", "walk3d")
+    assert message.startswith("file must be an existing file or the name of a network, sampler or ")
+    assert message.endswith(", got 'walk3d'; did you mean walk2d?")
 
 
 def test_show_reads_deeplabcut_tables(tmp_path, capsys, fails):
@@ -225,6 +283,9 @@ def test_show_and_convert_draws(tmp_path, capsys, fails):
     ("words", "expected"),
     [
         ("compare gait --samplers mcmc", ("'mcmc'", "exact", "nuts")),
+        ("compare gait --samplers nutz", ("got 'nutz'; did you mean nuts?",)),
+        ("show nutz", ("got 'nutz'; did you mean nuts?",)),
+        ("report .", ("folder must be written by compare(), got '.' without comparison.json",)),
         ("compare gait --samplers exact mh exact", ("samplers must be unique, got exact mh exac",)),
         ("compare gait --samplers mas.best", ("'mas.best'", "mas.reference_code")),
         ("compare jump", ("'jump'", "gait-monocular")),
@@ -236,7 +297,7 @@ def test_show_and_convert_draws(tmp_path, capsys, fails):
         ("compare --clips no/such/*.bvh", ("no/such/*.bvh",)),
         ("show no/such.bvh", ("no/such.bvh",)),
         ("convert no/such.bvh out.npz", ("no/such.bvh",)),
-        ("draw", ("'draw'", "compare, which, list, show, convert")),
+        ("draw", ("'draw'", "compare, report, which, list, show, convert")),
     ],
 )
 def test_invalid_options_are_one_line(words, expected, tmp_path, fails, monkeypatch):
@@ -307,3 +368,8 @@ def test_objects_are_read_from_text():
 def test_invalid_object_text_is_rejected(text, expected):
     with pytest.raises(ValueError, match=expected):
         object_from_text(text, [Plain, Step])
+
+
+def test_a_missing_package_prints_one_line(fails, monkeypatch):
+    monkeypatch.setitem(sys.modules, "safetensors", None)
+    assert "safetensors" in fails("show", WEIGHTS / "walk2d.safetensors")

@@ -219,7 +219,7 @@ def test_invalid_clips_give_one_error_line_and_no_files(write_walks, clips, tmp_
         "--test walk-0": "test requires --clips",
         f"{args} {twin}": "files must have unique names, got ",
         f"--clips {missing}": f"{missing}: No such file or directory",
-        f"{args} {large}": "large must have bones",
+        f"{args} {large}": f"{large}: bodies must be 0.3 to 3 m large",
         f"{args} {torn}": str(torn),
         f"{args} {kneeless}": "clip kneeless cannot be retargeted: ",
         "--steps 0": "steps must be an integer of at least 1, got 0",

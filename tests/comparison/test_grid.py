@@ -110,7 +110,7 @@ def test_results_are_identical_with_dask(grid, samplers, tmp_path):
 def test_registered_problems_and_budgets_give_identical_results_in_a_worker(capsys):
     settings = {**SMALL, "budget": Budget(evaluations=500), "time_limit": 100.0}
     here = compare("gait(frames=4)", Walking(), **settings | {"progress": True})
-    assert "runs" in capsys.readouterr().err
+    assert "[1/1] gait(frames=4) walking seed 0: " in capsys.readouterr().err
     there = compare("gait(frames=4)", Walking(), **settings | {"workers": 1})
     assert numbers(here.table()) == numbers(there.table())
     assert here.results[0].budget == there.results[0].budget
@@ -144,10 +144,14 @@ def test_failures_are_recorded_and_do_not_stop_the_grid(grid):
 
 
 def test_figures_are_written_for_every_problem_with_draws_or_references(grid, tmp_path):
-    names = ["quality_against_cost.png", "skeletons_generation.png", "skeletons_monocular.png"]
+    names = [
+        *("quality_against_cost", "skeletons_generation", "skeletons_monocular"),
+        "spread_monocular",
+    ]
     written = draw_comparison(grid, [generation(), monocular()], tmp_path)
-    assert written == [tmp_path / name for name in names]
-    assert all(path.read_bytes().startswith(b"\x89PNG") for path in written)
+    assert written == [tmp_path / f"{name}{kind}" for name in names for kind in (".png", ".pdf")]
+    for path in written:
+        assert path.read_bytes().startswith(b"\x89PNG" if path.suffix == ".png" else b"%PDF")
 
 
 def test_a_problem_is_sent_to_a_worker_once(tmp_path):
@@ -216,12 +220,12 @@ def test_posteriors_and_mappings_are_accepted():
         ("gate", None, {}, "problem must be one of gait, gait-monocular, .*, got 'gate'"),
         ("gait", "hamster", {}, "sampler must be one of ancestral3d, dvae, .*, got 'hamster'"),
         (3, None, {}, "problems must be names, Problem or MotionPosterior objects, got int"),
-        ("gait", PriorDraws, {}, "samplers must be names or objects .*, got the class PriorDraws"),
+        ("gait", PriorDraws, {}, "samplers must be names, objects .*, got the class PriorDraws"),
         ([], None, {}, "problems must contain at least one, got none"),
         ("gait", [], {}, "samplers must contain at least one, got none"),
         ("gait", "exact", {"executor": 3}, r"executor must be an object with submit\(\), .* got 3"),
         ("gait", "exact", {"executor": ThreadPoolExecutor}, "executor must be an object with subm"),
-        ("gait", [3], {}, "samplers must be names or objects with name, requires and .*, got 3"),
+        ("gait", [3], {}, "draws must be MotionDraws, an ArviZ tree, or an array .*, got int"),
         ("gait", ["exact", "exact"], {}, "samplers must have different names, got 'exact' twice"),
         ("gait", {"../up": "exact"}, {}, r"samplers must consist of .*, got '\.\./up'"),
         ("gait", "exact", {"draws": 9}, "draws must be an integer of at least 10, got 9"),

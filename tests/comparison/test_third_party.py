@@ -36,7 +36,7 @@ class Importance:
         points = posterior.initial(rng, self.candidates)
         weight = np.exp(posterior.log_likelihood(points))
         theta = points[rng.choice(self.candidates, (chains, draws), p=weight / weight.sum())]
-        flat = posterior.complete(rng, theta.reshape(-1, posterior.dim))
+        flat = posterior.complete(theta.reshape(-1, posterior.dim), rng)
         return MotionDraws.of(
             posterior, self, flat.reshape(chains, draws, *flat.shape[1:]), seed=seed,
             seconds=time.perf_counter() - start, theta=theta,

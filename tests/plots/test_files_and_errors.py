@@ -17,6 +17,8 @@ from probmotion.plots.pairs import draw_pairs
 from probmotion.plots.quality import plot_quality_against_cost
 from probmotion.plots.ranks import draw_ranks
 from probmotion.plots.skeletons import draw_skeletons
+from probmotion.plots.spread import plot_spread
+from probmotion.plots.style import COLUMN, PAGE
 
 WALK = make_gait("walk", frames=20)
 PAIR = Skeleton.preset("pair17")
@@ -50,17 +52,36 @@ RANKS = {"exact": {"speed": np.linspace(0, 1, 50)}}
         (draw_pairs, ({"real": POSES}, PAIR)),
         (draw_ranks, (RANKS,)),
         (draw_skeletons, ({"walk": WALK.positions[None]}, WALK.skeleton)),
+        (plot_spread, ({"mas": np.stack([WALK.positions, 1.1 * WALK.positions])}, WALK.skeleton)),
         (plot_quality_against_cost, (QUALITY,)),
     ],
 )
-def test_figures_are_written_as_png(draw, arguments, tmp_path):
-    draw(*arguments, tmp_path / "figure.png")
-    assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
+def test_figures_are_written_as_png_pdf_and_svg(draw, arguments, tmp_path):
+    begins = {"png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xml"}
+    for suffix, begin in begins.items():
+        path = tmp_path / f"figure.{suffix}"
+        width = draw(*arguments, path).get_size_inches()[0]
+        content = path.read_bytes()
+        assert content.startswith(begin)
+        assert width in (COLUMN, PAGE)
+    # The last figure is written again, later and by another object.
+    draw(*arguments, tmp_path / "again.svg")
+    assert (tmp_path / "again.svg").read_bytes() == content
     with pytest.raises(OSError, match="cannot write"):
         draw(*arguments, tmp_path / "missing" / "figure.png")
-    with pytest.raises(ValueError, match=r"path must end in \.png"):
+    with pytest.raises(ValueError, match=r"path must end in \.png, \.pdf or \.svg, got '.*jpg'"):
         draw(*arguments, tmp_path / "figure.jpg")
-    assert len(list(tmp_path.iterdir())) == 1
+    assert len(list(tmp_path.iterdir())) == 4
+
+
+def test_pdf_files_are_equal_and_embed_truetype_fonts(tmp_path):
+    for name in ("one.pdf", "two.pdf"):
+        draw_generation(GENERATION, {"fid": "FID"}, tmp_path / name)
+    content = (tmp_path / "one.pdf").read_bytes()
+    assert content == (tmp_path / "two.pdf").read_bytes()
+    assert b"/FontFile2" in content
+    assert b"/Type3" not in content
+    assert b"CreationDate" not in content
 
 
 NAN = np.full((1, 2, 17, 3), np.nan)
@@ -96,6 +117,7 @@ TWO_SETTINGS = pd.concat([ERRORS, ERRORS.assign(setting="V = 12")])
         (draw_skeletons, ({}, WALK.skeleton), "rows must contain at least one label with motions"),
         (draw_skeletons, ({"a": POSES}, WALK.skeleton), r"rows\['a'\] must have shape"),
         (draw_skeletons, ({"a": NAN}, WALK.skeleton), r"rows\['a'\] must be finite, got 102 val"),
+        (plot_spread, ({"a": WALK.positions[None]}, WALK.skeleton), "at least two draws, got one"),
         (plot_quality_against_cost, (QUALITY[:1],), "table must have a sampler with a headline"),
     ],
 )

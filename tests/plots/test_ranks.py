@@ -35,7 +35,7 @@ def test_histograms_contain_all_ranks_and_blocks_have_titles():
 def test_lines_are_distribution_functions_and_coverage():
     values_of = ranks()
     figure = draw_ranks({"exact": values_of})
-    (difference,) = panels(figure, "distribution function minus uniform")
+    (difference,) = panels(figure, "ECDF minus uniform")
     (coverage,) = panels(figure, "coverage of credible sets")
     points = evaluation_points(120)
     drawn = [line.get_ydata() for line in difference.lines if len(line.get_xdata()) == len(points)]
@@ -54,7 +54,7 @@ def test_lines_are_distribution_functions_and_coverage():
 def test_bands_are_those_of_the_uniformity_test():
     figure = draw_ranks({"exact": ranks()})
     points, (lower, upper) = evaluation_points(120), ecdf_band(120)
-    titles = {"distribution function minus uniform": points, "coverage of credible sets": 0}
+    titles = {"ECDF minus uniform": points, "coverage of credible sets": 0}
     for title, shift in titles.items():
         (axes,) = panels(figure, title)
         corners = axes.collections[0].get_paths()[0].vertices

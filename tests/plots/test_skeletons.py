@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 
 from probmotion import Skeleton
@@ -24,7 +25,7 @@ def bones(figure, colour, strip=0):
     segments = [
         np.array(lines.get_segments())
         for lines in figure.axes[strip].collections
-        if to_hex(lines.get_color()[0]).upper() == colour
+        if isinstance(lines, LineCollection) and to_hex(lines.get_color()[0]).upper() == colour
     ]
     return np.concatenate(segments)
 

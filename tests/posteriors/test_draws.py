@@ -40,8 +40,8 @@ def some_draws(**changes):
         "theta": rng.standard_normal((CHAINS, DRAWS, DIM)),
         "log_density": rng.standard_normal((CHAINS, DRAWS)),
         "statistics": {
-            "acceptance": rng.random((CHAINS, DRAWS)),
-            "divergent": rng.random((CHAINS, DRAWS)) < 0.5,
+            "acceptance_rate": rng.random((CHAINS, DRAWS)),
+            "diverging": rng.random((CHAINS, DRAWS)) < 0.5,
             "step_size": rng.random(CHAINS),
         },
         "counts": {"density": 2**40, "gradient": 0},
@@ -129,7 +129,7 @@ def test_conversion_to_arviz():
     draws = some_draws()
     tree = draws.to_arviz()
     assert set(tree["posterior"].data_vars) == {"positions", "theta"}
-    statistics = {"lp", "acceptance", "divergent", "step_size"}
+    statistics = {"lp", "acceptance_rate", "diverging", "step_size"}
     assert set(tree["sample_stats"].data_vars) == statistics
     np.testing.assert_array_equal(tree["sample_stats"]["lp"], draws.dataset["log_density"])
     theta = arviz_base.extract(tree, var_names=["theta"], combined=True)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from probmotion import Cameras, Joints3D, Keypoints2D, Motion, MotionPosterior, Skeleton
-from probmotion.arrays import array_namespace, constant
+from probmotion.arrays import array_namespace, constant, logsumexp
 
 FRAMES, CHAIN = 2, Skeleton(["hip", "knee"], [-1, 0])
 DIM = FRAMES * 2 * 3
@@ -35,7 +35,8 @@ class Turned(Flat):
 
     def log_likelihood(self, theta, likelihood):
         both = [likelihood.log_density(sign * self.motion(theta)) for sign in (1.0, -1.0)]
-        return np.logaddexp(*both) - np.log(2)
+        xp = array_namespace(theta)
+        return logsumexp(xp.stack(both, axis=-1)) - float(np.log(2))
 
     def complete(self, rng, theta, likelihood):
         signs = rng.choice([-1.0, 1.0], len(theta))
@@ -68,13 +69,31 @@ def test_marginalised_variables(likelihood):
     theta = np.random.default_rng(2).standard_normal((400, DIM))
     wanted = prior.log_density(theta) + prior.log_likelihood(theta, likelihood)
     np.testing.assert_allclose(posterior.log_density(theta), wanted)
-    motions = posterior.complete(np.random.default_rng(3), theta)
+    motions = posterior.complete(theta, np.random.default_rng(3))
     unchanged = (motions == posterior.motion(theta)).all(axis=(1, 2, 3)).mean()
     assert unchanged == pytest.approx(0.5, abs=0.125)
     plain = MotionPosterior(Flat(), likelihood)
     rng = np.random.default_rng(3)
-    np.testing.assert_array_equal(plain.complete(rng, theta), plain.motion(theta))
+    np.testing.assert_array_equal(plain.complete(theta, rng), plain.motion(theta))
     assert rng.random() == np.random.default_rng(3).random()  # rng is unused
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+@pytest.mark.parametrize("prior", [Flat, Turned])
+def test_batches(prior, batch, library, likelihood):
+    posterior = MotionPosterior(prior(), likelihood)
+    theta = np.random.default_rng(2).standard_normal((*batch, DIM))
+    motions = posterior.complete(library.array(theta))
+    assert motions.shape == (*batch, FRAMES, 2, 3)
+    assert isinstance(motions, np.ndarray)
+    rows = theta.reshape(-1, DIM)
+    wanted = posterior.complete(rows).reshape(motions.shape)
+    np.testing.assert_allclose(motions, wanted, rtol=0, atol=10 * library.tolerance)
+    log_density = np.asarray(posterior.log_density(library.array(theta)))
+    assert log_density.shape == batch
+    wanted = [posterior.log_density(row[None])[0] for row in rows]
+    rtol = 1e-10 if library.dtype == "float64" else 1e-4
+    np.testing.assert_allclose(log_density.reshape(-1), wanted, rtol=rtol)
 
 
 PRIOR = MotionPosterior(Flat())
@@ -108,7 +127,7 @@ def test_likelihoods_that_do_not_match_are_refused(likelihood, message):
         (lambda: MotionPosterior("walk"), "prior must have skeleton, frames, .*, got str"),
         (lambda: PRIOR.log_density(np.zeros((3, 5))), r"shape \(…, 12\), got"),
         (lambda: PRIOR.motion(np.zeros((3, 5))), r"shape \(…, 12\), got \(3, 5"),
-        (lambda: PRIOR.complete(None, np.zeros(DIM)), r"shape \(n, 12\), got"),
+        (lambda: PRIOR.complete(np.zeros(5)), r"shape \(…, 12\), got"),
         (lambda: PRIOR.log_likelihood(np.zeros(DIM)), "must have a likelihood"),
     ],
 )

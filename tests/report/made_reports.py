@@ -11,6 +11,7 @@ from probmotion.comparison.results.plan import Plan
 from probmotion.comparison.results.run_results import RunResult
 from probmotion.comparison.results.stored_problems import store_problem
 from probmotion.data.synthetic.gaits import make_gait
+from probmotion.metrics.verdict import Quantity, Verdict
 from probmotion.models import GaussianMixtureMotion
 from probmotion.posteriors.likelihoods import Joints3D, Keypoints2D
 from probmotion.posteriors.problem import Problem
@@ -74,6 +75,18 @@ class MadeComparison(Comparison):
             failure = Failure("crashed", "singular matrix", unsupported=False)
         metrics = {"swd_ratio": swd + seed, "seconds": 3 * swd, "odd_one": 7.0, "rhat": np.nan}
         return RunResult(problem, sampler, seed, "", {} if failure else metrics, failure)
+
+    def judge(self, problem: str, **words: str) -> None:
+        """Set the verdicts on samplers."""
+        quantity = Quantity("variance", 0.5, 1.0, 1.25, 0.001, 0.9, 40)
+        sentences = {
+            "undecided": "undecided at 9 draws",
+            "overconfident": "overconfident ×1.3 and biased by 2 sd",
+            "biased": "biased by 2 sd",
+        }
+        for name, word in words.items():
+            verdict = Verdict(word, sentences.get(word, word), 9, (quantity,))
+            self._verdicts[problem, name] = verdict
 
     def draws(self, problem: str, sampler: str, seed: int = 0) -> MotionDraws:
         rng = seeds.generator(seed, problem, sampler)

@@ -5,7 +5,10 @@ from __future__ import annotations
 import base64
 import html
 import io
+import json
 import re
+from dataclasses import replace
+from datetime import date
 from html.parser import HTMLParser
 
 import numpy as np
@@ -21,10 +24,16 @@ from made_reports import (
 from PIL import Image
 
 from probmotion.calibration import calibrate
+from probmotion.comparison.results.plan import Plan
 from probmotion.comparison.results.stored_problems import StoredProblem, read_stored, store_problem
 from probmotion.comparison.results.table import ComparisonTable
 from probmotion.plots.motion_data import Shown, motion_numbers
-from probmotion.report.animations import BUDGET, shown_problems
+from probmotion.report.animations import (
+    BUDGET,
+    compared_draws,
+    featured_problem,
+    shown_problems,
+)
 from probmotion.report.page import write_report
 from probmotion.samplers import ScoreDistillation
 
@@ -97,9 +106,9 @@ def test_page_is_well_formed_self_contained_and_escaped(page):
     assert {link.removeprefix("#") for link in tags.links} <= set(tags.ids)
     assert not re.search(r"https?:|src=\"(?!data:)|@import|url\(", page)
     assert "default-src 'none'" in page
-    assert len(page) < 400_000
-    # The data of three problems, and the script of the page.
-    assert tags.kinds.count("script") == 4
+    assert len(page) < 500_000
+    # The data of three problems and of the first screen, and the script of the page.
+    assert tags.kinds.count("script") == 5
     assert not {"b", "i", "u"} & set(tags.kinds)
     assert html.escape(MARKUP) in page
 
@@ -112,12 +121,95 @@ def test_every_run_is_in_the_tables(page, made):
     some = [row for row in rows if row[0] == "b<i>ad (1 of 2 seeds; crashed)"]
     assert len(some) == 3 * len(made.plan.problems)
     assert "5.50" in some[0][2]
-    # A sampler without draws has a single cell with the reason.
-    assert [row for row in rows if row[0] == "none"] == 9 * [["none", "obs<u>erved"]]
+    # A sampler without draws has a single cell with the reason, in a row of each problem's tables.
+    assert [row for row in rows if row[0] == "none"][1:] == 9 * [["none", "obs<u>erved"]]
     assert ["sampler", "odd_one"] in rows
-    overview = [row for row in rows if row[0] in made.plan.problems]
-    assert [row[1] for row in overview] == 3 * ["swd_ratio"]
-    assert all("obs<u>erved" in row[4] for row in overview)
+
+
+def test_verdicts_are_words_with_symbols_which_open_their_numbers(tmp_path):
+    samplers = {"good": 1.0, "b<i>ad": 5.5, "unsure": 1.3, "none": None}
+    made = MadeComparison(tmp_path, [joints_problem(), generation_problem()], samplers)
+    made.judge("generation", good="right", unsure="undecided", **{"b<i>ad": "overconfident"})
+    page = write(made, tmp_path)
+    rows = rows_of(page)
+    assert rows[0] == ["sampler", "joints", "generation"]
+    words = {row[0]: row[1:] for row in rows[1:5]}
+    assert words == {
+        "good": ["–no verdict", "●right"],
+        "b<i>ad": ["–no verdict", "▲overconfident ×1.3 and biased by 2 sd"],
+        "unsure": ["–no verdict", "○undecided at 9 draws"],
+        "none": 2 * ["–no draws (obs<u>erved): it cannot " + MARKUP],
+    }
+    opened = re.findall(r'popovertarget="([^"]*)"', page)
+    assert len(opened) == 3
+    for key in opened:
+        (numbers,) = re.findall(rf'<div popover id="{key}".*?</div>', page, re.DOTALL)
+        assert '<th scope="row">variance</th><td>0.5</td><td>0.8–1.25</td>' in numbers
+    # Colour is not the only sign, and a pointer over the word shows the numbers too.
+    assert page.count("variance 0.5 (0.8–1.25): outside") == 3
+
+
+def test_first_screen_names_command_date_machine_and_budget(tmp_path):
+    made = MadeComparison(tmp_path, [generation_problem()], SAMPLERS)
+    made.plan = replace(
+        made.plan, date="2026-11-24", machine="2 cores", budget="6 seconds per run",
+        versions={"probmotion": "0.2", "torch": "2.9", "scipy": "1.0"},
+        command=f"probmotion compare '{MARKUP}'",
+    )  # fmt: skip
+    page = write(made, tmp_path)
+    (facts,) = re.findall(r'<ul class="facts">(.*?)</ul>', page, re.DOTALL)
+    texts = [html.unescape(text) for text in re.findall(r"<li>(.*?)</li>", facts)]
+    assert texts == [
+        "2026-11-24", "2 cores", "8 draws on 2 chains", "6 seconds per run", "seed 0",
+        "probmotion 0.2, torch 2.9",
+    ]  # fmt: skip
+    (command,) = re.findall(r"<code[^>]*>(.*?)</code>", facts)
+    assert html.unescape(command) == made.plan.command
+    made.plan = replace(made.plan, command="")
+    assert 'data-does="copy"' not in write(made, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("argv", "command"),
+    [
+        (["/usr/bin/probmotion", "compare", "a b", "--seconds", "3"],
+         "probmotion compare 'a b' --seconds 3"),
+        (["mine.py", "compare"], ""),
+    ],
+)  # fmt: skip
+def test_the_command_of_a_comparison_is_stored_with_it(argv, command, tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.argv", argv)
+    Plan.of({"generation": generation_problem()}, {}, draws=8, chains=2, seeds=1).save(tmp_path)
+    monkeypatch.setattr("sys.argv", ["probmotion", "report", "folder"])
+    assert Plan.load(tmp_path).command == command
+    assert Plan.load(tmp_path).date == date.today().isoformat()
+
+
+def test_comparison_shows_truth_recommended_and_wrong_samplers(tmp_path):
+    samplers = {"exact": 1.0, "bad": 5.0, "fast": 1.0, "slow": 2.0, "worse": 9.0, "none": None}
+    problems = [generation_problem(), joints_problem(), filmed_problem(3)]
+    made = MadeComparison(tmp_path, problems, samplers)
+    made.judge("joints", exact="right", fast="right", slow="right", bad="biased", worse="biased")
+    # The first problem with observations.
+    assert featured_problem(made) == "joints"
+    page = compared_draws(made, "joints", made.verdicts()["joints"])
+    captions = re.findall(r"<figcaption>(.*?)</figcaption>", page)
+    assert captions == [
+        "truth", "fast: right", *(f"{name}: biased by 2 sd" for name in ("bad", "worse"))
+    ]  # fmt: skip
+    data = json.loads(re.findall(r'json">(.*?)</script>', page)[0])
+    assert [len(row) for row in data["rows"]] == [1, 4, 4, 4]
+    # Joints are coloured by their standard deviation over all draws.
+    drawn = made.draws("joints", "bad").flat()
+    sd = np.frombuffer(base64.b64decode(data["sds"][2]), "<i2").reshape(drawn.shape[1:3])
+    expected = 1000 * np.sqrt(drawn.var(axis=0, ddof=1).sum(axis=-1))
+    np.testing.assert_allclose(sd, expected, atol=0.51)
+    assert data["sds"][0] is None
+    # Undecided samplers come before wrong ones if none is right.
+    made.judge("joints", exact="undecided", fast="undecided", slow="biased", bad="biased")
+    page = compared_draws(made, "joints", made.verdicts()["joints"])
+    assert "fast: undecided" in page
+    assert "<figcaption>exact" not in page
 
 
 def test_failures_link_to_their_notes(page, made):
@@ -257,6 +349,6 @@ def test_figures_reduce_the_budget_of_the_motions(made, tmp_path, monkeypatch):
     shown = "probmotion.report.page.shown_problems"
     monkeypatch.setattr(shown, lambda comparison, budget: budgets.append(budget) or {})
     page = write(made, tmp_path, Calibrated())
-    figures = [base64.b64decode(text) for text in re.findall(r'png;base64,([^"]*)"', page)]
+    figures = [base64.b64decode(text) for text in re.findall(r';base64,([^"]*)" alt', page)]
     assert len(figures) == len(made.plan.problems) + 1
     assert budgets == [BUDGET - sum(map(len, figures))]

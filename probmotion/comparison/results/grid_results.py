@@ -6,6 +6,7 @@ import json
 import shutil
 import weakref
 from dataclasses import asdict
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
@@ -16,7 +17,9 @@ from probmotion.comparison.results.run_results import (
     read_result,
     used_of_budget,
 )
+from probmotion.comparison.results.summary import summary, verdict_text
 from probmotion.files import written_whole
+from probmotion.metrics.verdict import DrawStatistics, Verdict, judge
 from probmotion.posteriors.draws import MotionDraws
 
 if TYPE_CHECKING:
@@ -24,7 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = ["GridResults"]
 
-_TABLE, _FAILURES = "table.csv", "failures.json"
+_TABLE, _TEXT, _FAILURES = "table.csv", "table.txt", "failures.json"
 
 
 class GridResults:
@@ -99,7 +102,8 @@ class GridResults:
         """Return the tidy data frame with columns problem, sampler, seed, metric, value.
 
         A run without draws has a single metric, ``unsupported`` or ``failed``, equal to 1.
-        The table prints mean ± standard deviation over seeds, with one block per problem.
+        The table prints verdicts and mean ± standard deviation over seeds, with one block per
+        problem.
         """
         from probmotion.comparison.results.table import ComparisonTable
 
@@ -117,10 +121,58 @@ class GridResults:
             "problems": self.plan.problems,
             "samplers": list(self.plan.samplers),
             "words": words,
+            "verdicts": {
+                problem: {
+                    sampler: (
+                        verdict_text(self, problem, sampler),
+                        "" if verdict.word == "failed" else verdict.sentence,
+                    )
+                    for sampler, verdict in row.items()
+                }
+                for problem, row in self.verdicts().items()
+            },
             "notes": self.notes,
             "draws": self.plan.draws,
         }
         return table
+
+    def verdict(self, problem: str, sampler: str) -> Verdict | None:
+        """Return the verdict on a sampler, over all seeds; None without reference draws.
+
+        A sampler without draws in some seed has the word ``failed`` and the reason.
+        """
+        return self._verdicts.get((problem, sampler))
+
+    def verdicts(self) -> dict[str, dict[str, Verdict]]:
+        """Return the verdicts by problem and sampler."""
+        return {
+            problem: {
+                sampler: self._verdicts[problem, sampler]
+                for sampler in self.plan.samplers
+                if (problem, sampler) in self._verdicts
+            }
+            for problem in self.plan.problems
+        }
+
+    @cached_property
+    def _verdicts(self) -> dict[tuple[str, str], Verdict]:
+        """Verdicts by problem and sampler."""
+        runs: dict[tuple[str, str], list[RunResult]] = {}
+        for run in self.results:
+            runs.setdefault((run.problem, run.sampler), []).append(run)
+        verdicts = {}
+        for address, each in runs.items():
+            failures = [run.failure for run in each if run.failure is not None]
+            statistics = [DrawStatistics(**run.statistics) for run in each if run.statistics]
+            if failures:
+                verdicts[address] = Verdict("failed", f"failed: {failures[0].message}", 0)
+            elif statistics:
+                verdicts[address] = judge(statistics)
+        return verdicts
+
+    def summary(self) -> str:
+        """Return a sentence per problem and a table of verdicts, as text of 100 columns."""
+        return summary(self)
 
     def draws(self, problem: str, sampler: str, seed: int = 0) -> MotionDraws:
         """Return the draws of one run.
@@ -144,7 +196,10 @@ class GridResults:
         )
 
     def write(self, folder: str | Path) -> None:
-        """Write ``table.csv`` and ``failures.json``; copy the runs if ``folder`` is another one."""
+        """Write ``table.csv``, ``table.txt`` with legends and notes, and ``failures.json``.
+
+        Runs are copied if ``folder`` is another one.
+        """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         if folder.resolve() != self.folder.resolve():
@@ -159,8 +214,11 @@ class GridResults:
                 if (self.folder / part).exists():
                     shutil.copytree(self.folder / part, folder / part, dirs_exist_ok=True)
             self.plan.save(folder)
+        table = self.table()
         with written_whole(folder / _TABLE) as unfinished:
-            self.table().to_csv(unfinished, index=False)
+            table.to_csv(unfinished, index=False)
+        with written_whole(folder / _TEXT) as unfinished:
+            unfinished.write_text(f"{table}\n", encoding="utf-8")
         failures = [
             {"problem": result.problem, "sampler": result.sampler, "seed": result.seed}
             | asdict(result.failure)
@@ -171,4 +229,4 @@ class GridResults:
             unfinished.write_text(json.dumps(failures, indent=1), encoding="utf-8")
 
     def __repr__(self) -> str:
-        return str(self.table())
+        return self.summary()

@@ -1,4 +1,4 @@
-"""Headline metric of a problem, and best and statistically tied samplers per metric."""
+"""Headline metrics of a problem, and best and statistically tied samplers per metric."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from probmotion.metrics.intervals import best_and_tied
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["HEADLINE_METRICS", "best_of", "headline_metric", "seed_values"]
+__all__ = ["HEADLINE_METRICS", "best_of", "headline_metric", "headline_metrics", "seed_values"]
 
 HEADLINE_METRICS: Mapping[str, str] = {
     "swd_ratio": "sliced Wasserstein distance to reference draws (1: that of other references)",
@@ -21,6 +21,7 @@ HEADLINE_METRICS: Mapping[str, str] = {
     "g_mpjpe_mm": "mean distance of a joint from the truth (G-MPJPE, mm)",
 }
 """Descriptions by metric, in order of preference."""
+_FURTHER_METRICS = ("variance_ratio", "mean_error_sd", "off_manifold_ratio", "c2st")
 
 _RATIO: Mapping[str, Any] = {"target": 1.0, "ratio": True}  # ideal value 1, log scale
 _LESS: Mapping[str, Any] = {"target": None}  # lower is better
@@ -59,6 +60,16 @@ def headline_metric(table: pd.DataFrame) -> str | None:
     values = table["value"].to_numpy(float)
     measured = set(table["metric"][np.isfinite(values) & (values > 0)])
     return next((name for name in HEADLINE_METRICS if name in measured), None)
+
+
+def headline_metrics(table: pd.DataFrame) -> list[str]:
+    """Return the metrics of a table for a paper, in order of preference."""
+    measured = set(table["metric"])
+    return [
+        name
+        for name in (*HEADLINE_METRICS, *_FURTHER_METRICS)
+        if name in measured and not ("swd_ratio" in measured and _is_distance_to_truth(name))
+    ]
 
 
 def seed_values(table: pd.DataFrame) -> dict[tuple[str, str], pd.Series]:

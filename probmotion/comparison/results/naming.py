@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+import numpy as np
+import xarray as xr
+
+from probmotion.posteriors.draws import MotionDraws
+from probmotion.posteriors.finished import FinishedDraws
 from probmotion.posteriors.posterior import MotionPosterior
-from probmotion.posteriors.problem import Problem
+from probmotion.posteriors.problem import Problem, problem_of
 from probmotion.posteriors.sampling import Sampler, default_sampler, importable_samplers
 from probmotion.problems.catalogue import load_problem, problem_names
 
@@ -18,7 +23,8 @@ _NAME = re.compile(r"\w[\w.,=+() -]*")
 _LONGEST = 200
 
 AnyProblem = str | Problem | MotionPosterior
-AnySampler = str | Sampler
+AnySampler = Any
+"""Name, sampler, finished draws, or function ``(log_density, dim, rng, draws) → θ``."""
 
 
 def named_problems(problems: Any) -> dict[str, str | Problem]:
@@ -31,7 +37,7 @@ def named_problems(problems: Any) -> dict[str, str | Problem]:
             _add("problems", named, label or given.name, _registered_name(given) or given)
         elif isinstance(given, MotionPosterior):
             name = label or "posterior"
-            _add("problems", named, name, Problem(name, "a user-supplied posterior", given))
+            _add("problems", named, name, problem_of(name, given))
         else:
             raise ValueError(
                 "problems must be names, Problem or MotionPosterior objects, got "
@@ -57,21 +63,36 @@ def _registered_name(problem: Problem) -> str | None:
 def named_samplers(samplers: Any) -> dict[str, Sampler]:
     """Return samplers by their names in tables; all registered samplers for None."""
     named: dict[str, Sampler] = {}
-    for label, given in _labelled(
-        list(importable_samplers()) if samplers is None else samplers, AnySampler
-    ):
-        if isinstance(given, str):
-            _add("samplers", named, label or given, default_sampler(given))
-        elif isinstance(given, Sampler) and not isinstance(given, type):
-            _add("samplers", named, label or given.name, given)
-        else:
-            kind = f"the class {given.__name__}" if isinstance(given, type) else f"{given!r}"
-            raise ValueError(
-                f"samplers must be names or objects with name, requires and sample(), got {kind}"
-            )
+    several = list(importable_samplers()) if samplers is None else samplers
+    for label, given in _labelled(several, _ONE_SAMPLER):
+        sampler = _sampler(given, label)
+        name = given if isinstance(given, str) else sampler.name
+        _add("samplers", named, label or name, sampler)
     if not named:
         raise ValueError("samplers must contain at least one, got none")
     return named
+
+
+# A list contains several samplers; an array or a tree contains the draws of one.
+_ONE_SAMPLER = str | Sampler | MotionDraws | np.ndarray | xr.DataTree | Callable
+
+
+def _sampler(given: Any, label: str | None) -> Sampler:
+    """Return a sampler given as a name, object, function or finished draws."""
+    if isinstance(given, str):
+        return default_sampler(given)
+    if isinstance(given, type):
+        raise ValueError(
+            "samplers must be names, objects with name, requires and sample(), functions or "
+            f"finished draws, got the class {given.__name__}"
+        )
+    if isinstance(given, Sampler):
+        return given
+    if callable(given):
+        from probmotion.samplers.mcmc.function import FunctionSampler
+
+        return FunctionSampler(given)
+    return FinishedDraws.of(given, label or "draws")
 
 
 def _labelled(given: Any, one: Any) -> list[tuple[str | None, Any]]:

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import datetime
 import json
+import os
+import platform
+import shlex
+import sys
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from probmotion.comparison.results.budgets import Budget, effort_of
 from probmotion.comparison.results.fingerprint import fingerprint
+from probmotion.comparison.results.run_results import read_result
 from probmotion.files import written_whole
+from probmotion.posteriors.draws import library_versions
 from probmotion.posteriors.problem import Problem
 from probmotion.posteriors.sampling import Sampler
 from probmotion.problems.catalogue import load_problem
@@ -18,8 +25,10 @@ from probmotion.problems.catalogue import load_problem
 __all__ = ["Plan"]
 
 _PLAN = "comparison.json"
-# Folders of format 1 stored runs in cells/<problem>/<sampler>/<seed>/cell.json.
-_FORMAT = 2
+# Folders of format 1 stored runs in cells/<problem>/<sampler>/<seed>/cell.json, and those of
+# format 2 plans without fingerprints.
+_FORMAT = 3
+_COMMAND_SEPARATOR = " && "
 
 
 @dataclass(frozen=True)
@@ -34,10 +43,19 @@ class Plan:
         Settings that differ from the defaults, by sampler name.
     draws, chains, seeds : int
         Arguments of :func:`~probmotion.comparison.compare`.
-    notes : tuple of str
-        Notes on the budget.
+    budget : str
+        Budget, such as ``"6 seconds per run"``; empty without one.
+    untuned : tuple of str
+        Samplers that the budget does not change.
     references : tuple of str
         Notes on problems whose reference draws come from long runs.
+    versions : dict of str
+        Library versions by name.
+    fingerprints : dict of dict
+        Fingerprints by name, of every ``"problem"`` and ``"sampler"``.
+    date, machine, command : str
+        Date of the last call, cores and Python of its machine, and the command lines of all calls,
+        joined by ``&&``; the last is empty outside ``probmotion``.
     """
 
     problems: dict[str, str]
@@ -45,8 +63,14 @@ class Plan:
     draws: int
     chains: int
     seeds: int
-    notes: tuple[str, ...] = ()
+    budget: str = ""
+    untuned: tuple[str, ...] = ()
     references: tuple[str, ...] = ()
+    versions: dict[str, str] = field(default_factory=dict)
+    fingerprints: dict[str, dict[str, str]] = field(default_factory=dict)
+    date: str = ""
+    machine: str = ""
+    command: str = ""
 
     @classmethod
     def of(
@@ -59,7 +83,13 @@ class Plan:
         budget: Budget | None = None,
         per: str = "run",
     ) -> Plan:
-        """Return the plan of a grid; notes state the budget ``per`` run or simulation."""
+        """Return the plan of a grid whose budget is ``per`` run or simulation.
+
+        Raises
+        ------
+        ValueError
+            If the content of a problem or sampler cannot be determined.
+        """
         loaded = {
             name: load_problem(source) if isinstance(source, str) else source
             for name, source in problems.items()
@@ -70,9 +100,82 @@ class Plan:
             draws=draws,
             chains=chains,
             seeds=seeds,
-            notes=() if budget is None else _budget_notes(budget, samplers, per),
+            budget="" if budget is None else f"{budget} per {per}",
+            untuned=tuple(
+                name
+                for name, sampler in samplers.items()
+                if budget is not None and not effort_of(sampler)
+            ),
             references=tuple(_reference_notes(loaded)),
+            versions=library_versions(),
+            fingerprints={"problem": _fingerprints(loaded), "sampler": _fingerprints(samplers)},
+            date=datetime.date.today().isoformat(),
+            machine=_machine(),
+            command=_command(),
         )
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes on the budget."""
+        notes = (f"every sampler had {self.budget}",) if self.budget else ()
+        if not self.untuned:
+            return notes
+        verb = "has" if len(self.untuned) == 1 else "have"
+        names = ", ".join(self.untuned)
+        return (*notes, f"{names} {verb} no effort setting and ran with the given settings")
+
+    def union(self, folder: Path) -> Plan:
+        """Return the union of this plan and the plan stored in ``folder``, if there is one.
+
+        Raises
+        ------
+        ValueError
+            If ``folder`` contains finished runs with other draws, chains, budget or library
+            versions, or of another problem or sampler with a name of this plan.
+        """
+        if not (folder / _PLAN).exists():
+            return self
+        stored = Plan.load(folder)
+        finished = [address[:2] for address in stored.runs() if _has_draws(folder, address)]
+        for name, stored_value, new_value in stored._differences(self):
+            if not finished:
+                return self
+            raise ValueError(
+                f"out must be a new folder, got {folder}, which contains finished runs with "
+                f"{name} {stored_value} instead of {new_value}"
+            )
+        for pair in finished:
+            for kind, name in zip(("problem", "sampler"), pair, strict=True):
+                before = stored.fingerprints[kind][name]
+                if self.fingerprints[kind].get(name, before) != before:
+                    raise ValueError(
+                        f"out must be a new folder, got {folder}, which contains finished runs of "
+                        f"another {kind} called {name}"
+                    )
+        commands = dict.fromkeys([*stored.command.split(_COMMAND_SEPARATOR), self.command])
+        return replace(
+            self,
+            problems=stored.problems | self.problems,
+            samplers=stored.samplers | self.samplers,
+            seeds=max(stored.seeds, self.seeds),
+            untuned=tuple(dict.fromkeys(stored.untuned + self.untuned)),
+            references=tuple(dict.fromkeys(stored.references + self.references)),
+            fingerprints={
+                kind: stored.fingerprints[kind] | self.fingerprints[kind]
+                for kind in self.fingerprints
+            },
+            command=_COMMAND_SEPARATOR.join(filter(None, commands)),
+        )
+
+    def _differences(self, other: Plan) -> Iterator[tuple[str, Any, Any]]:
+        """Yield name and both values of each option that all runs of a folder must share."""
+        for name in ("draws", "chains", "budget"):
+            if (mine := getattr(self, name)) != (theirs := getattr(other, name)):
+                yield name, mine or "none", theirs or "none"
+        for name in self.versions | other.versions:
+            mine, theirs = (plan.versions.get(name, "none") for plan in (self, other))
+            if mine != theirs:
+                yield name, mine, theirs
 
     def runs(self) -> Iterator[tuple[str, str, int]]:
         """Yield (problem, sampler, seed) in the order problem, seed, sampler."""
@@ -94,33 +197,42 @@ class Plan:
 
     @classmethod
     def load(cls, folder: Path) -> Plan:
-        """Read the plan in ``folder``."""
+        """Read the plan in ``folder``.
+
+        Raises
+        ------
+        ValueError
+            If there is none, it is damaged, or another version of this package wrote it.
+        """
         path = folder / _PLAN
-        cls.check_folder(folder)
         try:
             stored = json.loads(path.read_text(encoding="utf-8"))
-            del stored["format"]
-            return cls(**stored | {name: tuple(stored[name]) for name in ("notes", "references")})
+            version = stored.pop("format", 1)
+            if version == _FORMAT:
+                sequences = {name: tuple(stored[name]) for name in ("untuned", "references")}
+                return cls(**stored | sequences)
         except OSError as error:
             raise ValueError(
                 f"folder must be written by compare(), got {str(folder)!r} without {_PLAN}"
             ) from error
-        except (ValueError, TypeError, KeyError) as error:
+        except (AttributeError, ValueError, TypeError, KeyError) as error:
             raise ValueError(f"{path} is damaged: {error}") from error
+        raise ValueError(
+            f"out must be written by this version of probmotion (format {_FORMAT}), got "
+            f"{folder} of format {version}; use another folder"
+        )
 
-    @staticmethod
-    def check_folder(folder: Path) -> None:
-        """Raise ``ValueError`` if another version of this package wrote runs into ``folder``."""
-        try:
-            stored = json.loads((folder / _PLAN).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            return
-        version = stored.get("format", 1) if isinstance(stored, dict) else _FORMAT
-        if version != _FORMAT:
-            raise ValueError(
-                f"out must be written by this version of probmotion (format {_FORMAT}), got "
-                f"{folder} of format {version}; use another folder"
-            )
+
+def _machine() -> str:
+    cores = os.cpu_count() or 1
+    kind, python = platform.machine(), platform.python_version()
+    return f"{cores} core{'s' * (cores != 1)} ({kind}), Python {python}"
+
+
+def _command() -> str:
+    """Return the command line; empty if another program called the package."""
+    program, *arguments = sys.argv or [""]
+    return shlex.join(["probmotion", *arguments]) if Path(program).stem == "probmotion" else ""
 
 
 def _reference_notes(problems: Mapping[str, Problem]) -> Iterator[str]:
@@ -137,12 +249,20 @@ def _reference_notes(problems: Mapping[str, Problem]) -> Iterator[str]:
             )
 
 
-def _budget_notes(budget: Budget, samplers: Mapping[str, Sampler], per: str) -> tuple[str, ...]:
-    notes = [f"every sampler had {budget} per {per}"]
-    if free := [name for name, sampler in samplers.items() if not effort_of(sampler)]:
-        verb = "has" if len(free) == 1 else "have"
-        notes.append(f"{', '.join(free)} {verb} no effort setting and ran with the given settings")
-    return tuple(notes)
+def _fingerprints(named: Mapping[str, Any]) -> dict[str, str]:
+    """Return the fingerprints of problems or samplers; errors mention their names."""
+    fingerprints = {}
+    for name, value in named.items():
+        try:
+            fingerprints[name] = fingerprint(value)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from error
+    return fingerprints
+
+
+def _has_draws(folder: Path, address: tuple[str, str, int]) -> bool:
+    result = read_result(Plan.run_folder(folder, *address))
+    return result is not None and result.failure is None
 
 
 def _changed_settings(sampler: Any) -> dict[str, str]:
@@ -155,9 +275,9 @@ def _changed_settings(sampler: Any) -> dict[str, str]:
     except (TypeError, ValueError):  # a setting without a default
         usual = None
     return {
-        field.name: repr(getattr(sampler, field.name))
-        for field in fields(sampler)
-        if usual is None or not _equal(getattr(sampler, field.name), getattr(usual, field.name))
+        entry.name: repr(getattr(sampler, entry.name))
+        for entry in fields(sampler)
+        if usual is None or not _equal(getattr(sampler, entry.name), getattr(usual, entry.name))
     }
 
 

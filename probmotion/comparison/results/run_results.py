@@ -23,7 +23,8 @@ class RunResult:
     """Result of a finished run.
 
     ``budget`` contains the budget as text, the chosen settings and the amount used;
-    ``draws_bytes`` is the size of the draws file.
+    ``draws_bytes`` is the size of the draws file, and ``statistics`` are those of a verdict
+    (:class:`~probmotion.metrics.verdict.DrawStatistics`), absent without reference draws.
     """
 
     problem: str
@@ -34,6 +35,7 @@ class RunResult:
     failure: Failure | None = None
     budget: dict[str, Any] | None = None
     draws_bytes: int | None = None
+    statistics: dict[str, Any] | None = None
 
 
 def read_result(folder: Path) -> RunResult | None:

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
-from probmotion.comparison.results.headline_metrics import best_of, seed_values
+from probmotion.comparison.results.headline_metrics import best_of, headline_metrics, seed_values
 
 __all__ = ["BLOCKS", "ComparisonTable", "mean_and_sd"]
 
@@ -116,12 +116,21 @@ _LEGENDS = (
 )
 _NARROWEST = 10
 """Minimum width of wrapped column headings, characters."""
+_COLUMNS = 6
+"""Maximum number of columns of a table for a paper."""
+_LATEX = str.maketrans(
+    {character: rf"\{character}" for character in "&%$#_{}"}
+    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    | {"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", "–": "--"}
+    | {"±": r"$\pm$", "×": r"$\times$", "²": "$^2$"}
+)
+_MARKDOWN = str.maketrans({"|": r"\|", "*": r"\*", "<": "&lt;", "\\": r"\\"})
 
 
 class ComparisonTable(pd.DataFrame):
     """Data frame with columns problem, sampler, seed, metric, value; prints mean ± sd over seeds.
 
-    ``attrs`` contains problem descriptions, reasons for missing draws, and notes.
+    ``attrs`` contains problem descriptions, verdicts, reasons for missing draws, and notes.
     Slices are plain data frames.
     """
 
@@ -129,17 +138,13 @@ class ComparisonTable(pd.DataFrame):
     def _constructor(self) -> type[pd.DataFrame]:
         return pd.DataFrame
 
-    def __str__(self) -> str:
-        return self.summary()
-
     def __repr__(self) -> str:
-        return self.summary()
+        return str(self)
 
     def _repr_html_(self) -> None:
         return None
 
-    def summary(self) -> str:
-        """Return the table as text with a block per problem."""
+    def __str__(self) -> str:
         problems = list(dict.fromkeys(self["problem"]))
         parts = [self._problem(problem) for problem in problems]
         if self.groupby("problem")["seed"].nunique().gt(1).any():
@@ -148,6 +153,69 @@ class ComparisonTable(pd.DataFrame):
         if notes := self.attrs.get("notes"):
             parts.append("\n".join(notes))
         return "\n\n".join(parts) if parts else "no finished runs"
+
+    def to_latex(self) -> str:
+        """Return verdicts and headline metrics as a LaTeX ``tabular`` (package booktabs).
+
+        The table has at most six columns and a row per sampler, with a block per problem. Values
+        are mean ± standard deviation over seeds. Bold values are the best of their column or
+        statistically tied with the best; this requires at least two seeds.
+        """
+        header, blocks = self._for_paper()
+        lines = [
+            rf"\begin{{tabular}}{{ll{'r' * (len(header) - 2)}}}",
+            r"\toprule",
+            " & ".join(head.translate(_LATEX) for head in header) + r" \\",
+        ]
+        for problem, rows in blocks.items():
+            lines.append(r"\midrule")
+            if len(blocks) > 1:
+                title = problem.translate(_LATEX)
+                lines.append(rf"\multicolumn{{{len(header)}}}{{l}}{{{title}}} \\")
+            for row in rows:
+                texts = [(text.translate(_LATEX), bold) for text, bold in row]
+                cells = [rf"\textbf{{{text}}}" if bold else text for text, bold in texts]
+                lines.append(" & ".join(cells) + r" \\")
+        return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"])
+
+    def to_markdown(self) -> str:
+        """Return verdicts and headline metrics as Markdown, a table per problem as in LaTeX."""
+        header, blocks = self._for_paper()
+        rules = ["---", "---", *["---:"] * (len(header) - 2)]
+        tables = []
+        for problem, rows in blocks.items():
+            lines = [f"{problem.translate(_MARKDOWN)}\n"] if len(blocks) > 1 else []
+            lines += [f"| {' | '.join(header)} |", f"| {' | '.join(rules)} |"]
+            for row in rows:
+                texts = [(text.translate(_MARKDOWN), bold) for text, bold in row]
+                cells = [f"**{text}**" if bold else text for text, bold in texts]
+                lines.append(f"| {' | '.join(cells)} |")
+            tables.append("\n".join(lines))
+        return "\n\n".join(tables)
+
+    def _for_paper(self) -> tuple[list[str], dict[str, list[list[tuple[str, bool]]]]]:
+        """Return the headings, and by problem a row per sampler of texts and whether bold."""
+        metrics = ["seconds", *headline_metrics(self)][: _COLUMNS - 2]
+        names = {key: head for columns in BLOCKS.values() for key, head in columns.items()}
+        blocks: dict[str, list[list[tuple[str, bool]]]] = {}
+        for problem in dict.fromkeys(self["problem"]):
+            rows = pd.DataFrame(self[self["problem"] == problem])
+            samplers, seeds = list(dict.fromkeys(rows["sampler"])), sorted(set(rows["seed"]))
+            values = seed_values(rows)
+            symbols = {metric: self._symbols(metric, values, samplers, seeds) for metric in metrics}
+            verdicts = self.attrs.get("verdicts", {}).get(problem, {})
+            blocks[problem] = [
+                [(sampler, False), (verdicts.get(sampler, ("–",))[0], False)]
+                + [
+                    (
+                        mean_and_sd(values.get((sampler, metric))) or "–",
+                        symbols[metric].get(sampler, " ") != " ",
+                    )
+                    for metric in metrics
+                ]
+                for sampler in samplers
+            ]
+        return ["sampler", "verdict", *(names[metric] for metric in metrics)], blocks
 
     def legends(self) -> list[str]:
         """Return explanations of the metrics in the table."""
@@ -166,6 +234,12 @@ class ComparisonTable(pd.DataFrame):
         words = self.attrs.get("words", {})
         values = seed_values(rows)
         lines = [f"{problem}: {self.attrs.get('problems', {}).get(problem, '')}"]
+        verdicts = self.attrs.get("verdicts", {}).get(problem, {})
+        # Notes contain the reasons of failures.
+        judged = [[name, each] for name, (_, each) in verdicts.items() if name in samplers and each]
+        if judged:
+            width = max(len(name) for name, _ in judged)
+            lines += ["verdicts", *(f"{name:{width}}  {sentence}" for name, sentence in judged), ""]
         for title, columns in BLOCKS.items():
             shown = {key: head for key, head in columns.items() if key in set(rows["metric"])}
             if not set(shown) - {"seconds"}:
@@ -181,7 +255,9 @@ class ComparisonTable(pd.DataFrame):
                     entries[0] = words.get(f"{problem}/{sampler}", "")
                 body.append([sampler, *entries])
             lines.append(_aligned([title, *shown.values()], body))
-        if len(lines) == 1:
+        if not values.keys() - {
+            (name, word) for name in samplers for word in ("unsupported", "failed")
+        }:
             failed = [[sampler, words.get(f"{problem}/{sampler}", "")] for sampler in samplers]
             lines.append(_aligned(["no draws", ""], failed))
         return "\n".join(lines)

@@ -72,7 +72,7 @@ class GridRun(GridTask):
     def fail(self, error: BaseException) -> None:
         self._store({}, None, Failure.of(error))
 
-    def run(self, progress: bool) -> None:
+    def run(self) -> None:
         """Draw, measure and store the result; errors of the sampler are stored as failures.
 
         Raises
@@ -88,35 +88,43 @@ class GridRun(GridTask):
                 self.prepare()
                 problem = self.load()
                 with time_limit(self.limit):
-                    draws, metrics = self._measure(problem, progress)
+                    draws, metrics, statistics = self._measure(problem)
         # A sampler that calls sys.exit() must not end the grid.
         except (Exception, SystemExit) as error:
             self.fail(error)
         else:
-            self._store(metrics, draws, None)
+            self._store(metrics, draws, None, statistics)
 
-    def _measure(self, problem: Problem, progress: bool) -> tuple[MotionDraws, dict[str, float]]:
+    def _measure(
+        self, problem: Problem
+    ) -> tuple[MotionDraws, dict[str, float], dict[str, Any] | None]:
         from probmotion.metrics.measures import measure
+        from probmotion.metrics.verdict import draw_statistics
 
         # Changing "cell" would change all draws.
         seed = seeds.integer(self.seed, "cell", self.problem, self.sampler)
         with watched_memory() as peak:
-            draws = self._draw(problem.posterior, seed, progress)
+            draws = self._draw(problem.posterior, seed)
         # All samplers are measured against the same reference draws.
-        metrics = measure(problem, draws, seeds.integer(self.seed, "exact", self.problem))
+        reference = seeds.integer(self.seed, "exact", self.problem)
+        metrics = measure(problem, draws, reference)
+        statistics = None
+        if problem.has_reference:
+            statistics = draw_statistics(problem, draws, reference).to_json()
         if peak.mebibytes is not None:
             metrics["peak_memory_mib"] = peak.mebibytes
-        return draws, metrics
+        return draws, metrics, statistics
 
-    def _draw(self, posterior: MotionPosterior, seed: int, progress: bool) -> MotionDraws:
+    def _draw(self, posterior: MotionPosterior, seed: int) -> MotionDraws:
         """Return the sampler's draws after checking their number and values."""
-        draws = self.sample(self.with_sampler, posterior, seed, progress)
+        draws = self.sample(self.with_sampler, posterior, seed)
         if not isinstance(draws, MotionDraws):
             raise TypeError(f"{self.sampler} must return MotionDraws, got {type(draws).__name__}")
         if draws.skeleton != posterior.skeleton:
             raise ValueError(f"{self.sampler} must return draws of the posterior's skeleton")
         returned = tuple(draws.positions.sizes[axis] for axis in ("chain", "draw"))
-        if returned != (expected := (self.chains, self.draws // self.chains)):
+        expected = (self.chains, self.draws // self.chains)
+        if returned != expected and not getattr(self.with_sampler, "finished", False):
             raise ValueError(
                 f"{self.sampler} must return {expected[0]} chains of {expected[1]} draws, got "
                 f"{returned[0]} of {returned[1]}"
@@ -134,7 +142,11 @@ class GridRun(GridTask):
         return draws
 
     def _store(
-        self, metrics: dict[str, float], draws: MotionDraws | None, failure: Failure | None
+        self,
+        metrics: dict[str, float],
+        draws: MotionDraws | None,
+        failure: Failure | None,
+        statistics: dict[str, Any] | None = None,
     ) -> None:
         budget = None
         if self.budget is not None:
@@ -152,7 +164,9 @@ class GridRun(GridTask):
                 draws.save(unfinished / DRAWS)
                 size = (unfinished / DRAWS).stat().st_size
             address = (self.problem, self.sampler, self.seed)
-            result = RunResult(*address, self.fingerprint, metrics, failure, budget, size)
+            result = RunResult(
+                *address, self.fingerprint, metrics, failure, budget, size, statistics
+            )
             with open(unfinished / RESULT, "w", encoding="utf-8") as file:
                 json.dump(_without_nan(asdict(result)), file, indent=1)
             if self.path.exists():

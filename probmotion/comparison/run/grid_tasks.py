@@ -75,7 +75,7 @@ class GridTask:
         result = self.result()
         return result is not None and result.failure is None and not self.has_result()
 
-    def run(self, progress: bool) -> None:
+    def run(self) -> None:
         """Run and store the result or the failure."""
         raise NotImplementedError
 
@@ -91,14 +91,10 @@ class GridTask:
         """Load the problem before the time limit starts."""
         self.load()
 
-    def sample(
-        self, sampler: Sampler, posterior: MotionPosterior, seed: int, progress: bool
-    ) -> MotionDraws:
+    def sample(self, sampler: Sampler, posterior: MotionPosterior, seed: int) -> MotionDraws:
         """Return ``draws`` draws of a sampler, divided equally among the chains."""
         draws = self.draws // self.chains
-        return sampler.sample(
-            posterior, draws=draws, chains=self.chains, seed=seed, progress=progress
-        )
+        return sampler.sample(posterior, draws=draws, chains=self.chains, seed=seed, progress=False)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -119,7 +115,7 @@ class Pilot(GridTask):
     def fail(self, error: BaseException) -> None:
         self._store(PilotResult(self.fingerprint, {}, Failure.of(error)))
 
-    def run(self, progress: bool) -> None:
+    def run(self) -> None:
         assert self.budget is not None
         try:
             with one_thread():
@@ -136,7 +132,7 @@ class Pilot(GridTask):
     def _cost(self, problem: Problem, sampler: Sampler) -> float:
         assert self.budget is not None
         seed = seeds.integer(0, "pilot", self.problem, self.sampler)
-        return self.budget.spent(self.sample(sampler, problem.posterior, seed, progress=False))
+        return self.budget.spent(self.sample(sampler, problem.posterior, seed))
 
     def _store(self, result: PilotResult) -> None:
         try:

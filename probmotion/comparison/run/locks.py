@@ -1,4 +1,4 @@
-"""File locks that let only one process at a time run a problem in a results folder."""
+"""File locks of a results folder: one process runs a problem, one writes plan and table."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-__all__ = ["locked"]
+__all__ = ["locked", "plan_locked"]
 
 
 @contextmanager
@@ -42,4 +42,16 @@ def locked(folder: Path, problems: Iterable[str]) -> Iterator[None]:
                     f"out must support file locks, got {str(folder)!r}: "
                     f"{error.strerror or error}; use a folder on another file system"
                 ) from error
+        yield
+
+
+@contextmanager
+def plan_locked(folder: Path) -> Iterator[None]:
+    """Lock the plan and the table, so that one process at a time reads and writes them.
+
+    Call it within :func:`locked`, which raises if the folder does not support locks.
+    """
+    from filelock import FileLock
+
+    with FileLock(folder / ".lock", fallback_to_soft=False):
         yield

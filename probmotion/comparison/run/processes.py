@@ -191,7 +191,7 @@ def _work(connection: Connection) -> None:
             with suppress(Exception):  # run() raises the error again
                 task.prepare()
             connection.send_bytes(_STARTED)
-            task.run(False)
+            task.run()
         # Workers ignore Ctrl-C, so a KeyboardInterrupt was raised by the sampler.
         except (Exception, KeyboardInterrupt) as caught:
             error = caught

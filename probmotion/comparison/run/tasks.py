@@ -16,10 +16,8 @@ from probmotion.comparison.results.plan import Plan
 from probmotion.comparison.run.grid_runs import GridRun, forget_unfinished
 from probmotion.comparison.run.grid_tasks import GridTask, Pilot
 from probmotion.comparison.run.workers import run_tasks
-from probmotion.posteriors.draws import library_versions
 from probmotion.posteriors.problem import Problem
 from probmotion.posteriors.sampling import Sampler
-from probmotion.problems.catalogue import load_problem
 from probmotion.validation import check_count, check_positive
 
 __all__ = ["Grid", "check_grid_options", "refuse_other_settings", "run_grid"]
@@ -58,15 +56,6 @@ class Grid:
     budget: Budget | None = None
     limit: float | None = None
 
-    def __post_init__(self) -> None:
-        self._fingerprints = {
-            name: _fingerprint(name, load_problem(source) if isinstance(source, str) else source)
-            for name, source in self.problems.items()
-        }
-        for name, sampler in self.samplers.items():
-            _fingerprint(name, sampler)
-        self._versions = library_versions()
-
     def pilots(self) -> list[Pilot]:
         """Return the pilots, an empty list without a budget."""
         if self.budget is None:
@@ -81,8 +70,8 @@ class Grid:
 
     def _pilot(self, problem: str, sampler: str) -> Pilot:
         inputs = [
-            *(problem, self._fingerprints[problem], sampler, self.samplers[sampler]),
-            *(self.plan.draws, self.plan.chains, self._versions, self.budget),
+            *(problem, self._content(problem), sampler, self.samplers[sampler]),
+            *(self.plan.draws, self.plan.chains, self.plan.versions, self.budget),
         ]
         return Pilot(
             path=self.folder / "pilots" / problem / f"{sampler}.json",
@@ -98,8 +87,8 @@ class Grid:
         if result is not None and result.settings:
             with_sampler = replace(with_sampler, **result.settings)
         inputs: list[Any] = [
-            *(problem, self._fingerprints[problem], sampler, fingerprint(with_sampler), seed),
-            *(self.plan.draws, self.plan.chains, self._versions),
+            *(problem, self._content(problem), sampler, fingerprint(with_sampler), seed),
+            *(self.plan.draws, self.plan.chains, self.plan.versions),
         ]
         return self.run_class(
             path=self.plan.run_folder(self.folder, problem, sampler, seed),
@@ -111,6 +100,9 @@ class Grid:
             **self._common(problem, sampler),
         )
 
+    def _content(self, problem: str) -> str:
+        return self.plan.fingerprints["problem"][problem]
+
     def _common(self, problem: str, sampler: str) -> dict[str, Any]:
         return {
             "problem": problem,
@@ -121,14 +113,6 @@ class Grid:
             "limit": self.limit,
             "budget": self.budget,
         }
-
-
-def _fingerprint(name: str, value: Any) -> str:
-    """Return the fingerprint of a problem or sampler; errors mention its name."""
-    try:
-        return fingerprint(value)
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from error
 
 
 def run_grid(

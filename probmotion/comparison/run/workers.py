@@ -10,7 +10,7 @@ from typing import Any
 from probmotion.comparison.results.failures import ResultNotWritten
 from probmotion.comparison.run.grid_tasks import GridTask
 from probmotion.comparison.run.processes import Done, run_in_processes
-from probmotion.posteriors.sampling import progress_bar
+from probmotion.comparison.run.progress import reported
 
 __all__ = ["run_tasks"]
 
@@ -18,7 +18,7 @@ __all__ = ["run_tasks"]
 def run_tasks(
     tasks: Sequence[GridTask], workers: int, executor: Executor | None, progress: bool, label: str
 ) -> None:
-    """Run tasks with a progress bar; each task stores its own result or failure.
+    """Run tasks; each stores its own result or failure, and ``progress`` reports it.
 
     Tasks run on the executor if given, otherwise in ``workers`` processes, or in this process if
     ``workers`` is 0.
@@ -32,7 +32,7 @@ def run_tasks(
     """
     if not tasks:
         return
-    with progress_bar(len(tasks), label, progress) as bar:
+    with reported(tasks, label, progress) as report:
 
         def done(task: Any, error: BaseException | None) -> None:
             if isinstance(error, ResultNotWritten):
@@ -43,20 +43,20 @@ def run_tasks(
                 )
             if error is not None:
                 task.fail(error)
-            bar.update(1)
+            report(task)
 
         if executor is not None:
             _run_on(executor, tasks, done)
         elif workers == 0:
             for task in tasks:
-                _run_task(task, progress)
+                task.run()
                 done(task, None)
         else:
             run_in_processes(tasks, workers, done)
 
 
-def _run_task(task: GridTask, progress: bool = False) -> None:
-    task.run(progress)
+def _run_task(task: GridTask) -> None:
+    task.run()
 
 
 def _run_on(executor: Executor, tasks: Sequence[GridTask], done: Done) -> None:

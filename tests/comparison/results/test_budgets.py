@@ -149,7 +149,7 @@ def test_pilots_are_stored_for_later_runs(tmp_path):
     assert count(diary) == before + 2
     assert {str(result.budget) for result in more.results} == {str(first.results[0].budget)}
     for budget in (Budget(evaluations=3000), Budget(seconds=3.0), None):
-        with pytest.raises(ValueError, match="made with other settings"):
+        with pytest.raises(ValueError, match="contains finished runs with budget 2 000 evaluatio"):
             compare(generation(), sampler, **settings | {"budget": budget})
 
 

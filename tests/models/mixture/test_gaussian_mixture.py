@@ -229,7 +229,7 @@ def test_completed_draws_of_theta_have_the_posterior_mean(prior, motions):
     w = np.exp(posterior.log_likelihood(z))
     w /= w.sum()
     chosen = rng.choice(len(z), size=n, p=w)
-    X = MotionPosterior(prior, likelihood).complete(rng, z[chosen]).reshape(n, -1)
+    X = MotionPosterior(prior, likelihood).complete(z[chosen], rng).reshape(n, -1)
     error = X.std(axis=0) * np.sqrt(1 / n + (w**2).sum())
     assert (np.abs(X.mean(axis=0) - posterior.mean().ravel()) < 5 * error).all()
 

@@ -37,7 +37,7 @@ def test_draws_are_those_of_emcee(posterior, run):
     assert long.dataset["autocorrelation_time"][1] == 13
     # The acceptance rate of emcee is over 65 iterations, that of `Ensemble` over 64 of them.
     accepted = sampler.acceptance_fraction.mean()
-    assert abs(long.dataset["acceptance"][1] - accepted) <= 1 / 64
+    assert abs(long.dataset["acceptance_rate"][1] - accepted) <= 1 / 64
 
 
 def test_long_runs_estimate_their_autocorrelation_time(posterior, run):

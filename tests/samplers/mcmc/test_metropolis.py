@@ -18,7 +18,7 @@ def test_all_chains_are_evaluated_at_once_and_counted(run, evaluations):
     draws = run(QUICK, 5, chains=4)
     assert evaluations == [4] * (1 + 60 + 5 * 3)
     assert draws.counts == {"density": sum(evaluations)}
-    assert draws.dataset["acceptance"].dims == ("chain", "draw")
+    assert draws.dataset["acceptance_rate"].dims == ("chain", "draw")
 
 
 def test_chains_start_at_initial(run):

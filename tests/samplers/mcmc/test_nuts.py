@@ -42,16 +42,17 @@ def test_draws_are_those_of_numpyro(posterior, two_modes, long):
         chain.run(
             seeds.jax_key(3, "chain", 1),
             init_params=jax.numpy.asarray(start),
-            extra_fields=("num_steps", "accept_prob", "diverging"),
+            extra_fields=("num_steps", "accept_prob", "diverging", "energy"),
         )
         fields = chain.get_extra_fields()
         np.testing.assert_array_equal(long.dataset["theta"][1], chain.get_samples())
     density = two_modes.log_density(long.dataset["theta"].values)
     np.testing.assert_allclose(long.dataset["log_density"], density, rtol=1e-9)
-    np.testing.assert_array_equal(long.dataset["steps"][1], fields["num_steps"])
-    np.testing.assert_array_equal(long.dataset["acceptance"][1], fields["accept_prob"])
-    np.testing.assert_array_equal(long.dataset["divergent"][1], fields["diverging"])
-    assert long.counts["gradient"] > long.dataset["steps"].values.sum() + 2
+    np.testing.assert_array_equal(long.dataset["n_steps"][1], fields["num_steps"])
+    np.testing.assert_array_equal(long.dataset["acceptance_rate"][1], fields["accept_prob"])
+    np.testing.assert_array_equal(long.dataset["diverging"][1], fields["diverging"])
+    np.testing.assert_array_equal(long.dataset["energy"][1], fields["energy"])
+    assert long.counts["gradient"] > long.dataset["n_steps"].values.sum() + 2
     assert not jax.config.jax_enable_x64
 
 
@@ -59,7 +60,7 @@ def test_thinning_aggregates_the_statistics(run, long):
     thinned = run(replace(QUICK, thin=3), 43).dataset
     for name in ("theta", "log_density"):
         np.testing.assert_array_equal(thinned[name], long.dataset[name][:, 2:129:3])
-    for name, combine in (("acceptance", np.mean), ("divergent", np.any), ("steps", np.sum)):
+    for name, combine in (("acceptance_rate", np.mean), ("diverging", np.any), ("n_steps", np.sum)):
         threes = long.dataset[name].values[:, :129].reshape(2, 43, 3)
         np.testing.assert_allclose(thinned[name], combine(threes, axis=2))
 
@@ -127,7 +128,7 @@ def test_code_is_compiled_once_and_not_timed(two_modes):
     reported = sample(observed, 1, sampler=sampler, seed=1).seconds
     assert reported < (time.perf_counter() - start) / 2
     draws = sample(observed, 9, sampler=sampler, seed=8)
-    assert (draws.dataset["steps"] == 1).all()
+    assert (draws.dataset["n_steps"] == 1).all()
     with jax.enable_x64(True):
         kernel = compiled(observed, 51, 0.8, 1)
     assert kernel.advance._cache_size() == kernel.log_likelihood._cache_size() == 1

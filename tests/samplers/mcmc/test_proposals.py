@@ -43,7 +43,7 @@ def test_a_chain_that_never_moved_has_a_valid_covariance():
 def test_warm_up_reaches_the_target_acceptance(two_modes, proposal):
     sampler = MetropolisHastings(proposal=proposal, warmup=1500, thin=1)
     draws = sampler.sample(MotionPosterior(two_modes), draws=1000, chains=8, progress=False)
-    chains = draws.dataset["acceptance"].values.mean(axis=1)
+    chains = draws.dataset["acceptance_rate"].values.mean(axis=1)
     # After Robbins-Monro steps of size n^(−0.6) log s has a spread of about n^(−0.3).
     assert np.abs(chains.mean() - 0.4) < 0.04
     assert np.abs(chains - 0.4).max() < 0.12

@@ -153,7 +153,7 @@ def test_pseudo_marginal_chains_are_independent():
     start = np.zeros((4, 3))
     batch = sampler.sample(posterior, draws=20, chains=4, initial=start, progress=False)
     single = sampler.sample(posterior, draws=20, chains=1, initial=start[:1], progress=False)
-    assert float(batch.dataset["acceptance"].mean()) < 0.6
+    assert float(batch.dataset["acceptance_rate"].mean()) < 0.6
     for name in ("theta", "log_density"):
         assert np.array_equal(*(run.dataset[name].values[0] for run in (batch, single)))
 
