@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,10 +44,17 @@ def animated_motions(report: Path) -> dict[str, np.ndarray]:
     """Return the animated motions of a self-contained report by label, (n, L, J, 3), metres."""
     text = report.read_text(encoding="utf-8")
     assert not re.search(r"https?:|src=|href=|@import", text)
-    (given,) = re.findall(r"parentElement, (\{.*\})\);</script>", text)
+    (given,) = re.findall(r'json">(.*?)</script>', text)
     data = json.loads(given)
-    shape = (-1, data["frames"], data["joints"], 3)
-    return {row["label"][0]: np.reshape(row["motions"], shape) / 1000 for row in data["rows"]}
+    shape = (data["frames"], data["joints"], 3)
+    rows = [[_decoded(motion).reshape(shape) for motion in row] for row in data["rows"]]
+    labels = re.findall(r"<figcaption>(.*?)</figcaption>", text)
+    return {label: np.array(row) for label, row in zip(labels, rows, strict=True)}
+
+
+def _decoded(motion: dict[str, Any]) -> np.ndarray:
+    """Return the coordinates of an encoded motion, metres."""
+    return motion["unit"] / 1000 * np.frombuffer(base64.b64decode(motion["numbers"]), "<i2")
 
 
 # Libraries of Jupyter emit warnings.
