@@ -28,8 +28,10 @@ from sklearn.decomposition import PCA
 
 import probmotion as pm
 from probmotion import seeds
+from probmotion.metrics.chains import chain_diagnostics
 from probmotion.metrics.measures import load_libraries
-from probmotion.metrics.verdict import Verdict, draw_statistics, judge
+from probmotion.metrics.run_statistics import draw_statistics
+from probmotion.metrics.verdict import Verdict, judge
 from probmotion.posteriors import MotionDraws, Problem
 from probmotion.problems import load_problem
 
@@ -47,7 +49,7 @@ def verdict(problem: Problem, motions: np.ndarray) -> Verdict:
     draws = MotionDraws.of(
         problem.posterior, _Given(), motions[None], seed=0, seconds=0.0, independent=True
     )
-    return judge([draw_statistics(problem, draws, 0)])
+    return judge([draw_statistics(problem, draws, 0, {})])
 
 
 def exact(problem: Problem, sets: int, n: int = DRAWS) -> Iterator[np.ndarray]:
@@ -175,7 +177,7 @@ def measure_samplers() -> None:
         problem = load_problem(name)
         for seed in range(3):
             draws = pm.sample(problem, sampler, draws=DRAWS, seed=seed, progress=False, **settings)
-            judged = judge([draw_statistics(problem, draws, seed)])
+            judged = judge([draw_statistics(problem, draws, seed, chain_diagnostics(draws))])
             print(f"verdict_{sampler}_seed_{seed}: {judged}", flush=True)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,7 +11,8 @@ import numpy as np
 from probmotion import seeds
 from probmotion.comparison.results.naming import AnyProblem, named_problems, named_samplers
 from probmotion.comparison.results.table import BLOCKS
-from probmotion.metrics.verdict import Verdict, draw_statistics, judge
+from probmotion.metrics.run_statistics import draw_statistics
+from probmotion.metrics.verdict import Verdict, judge
 from probmotion.posteriors.draws import MotionDraws
 from probmotion.posteriors.finished import FinishedDraws
 from probmotion.posteriors.posterior import MotionPosterior
@@ -150,11 +150,11 @@ def score(target: AnyProblem, draws: Any, *, seed: int = 0) -> Score:
     known = draws if isinstance(draws, MotionDraws) else finished.sample(chosen.posterior)
     _check_draws(known.flat(), chosen)
     reference = seeds.integer(seed, "exact", chosen.name)
+    metrics = measure(chosen, known, reference)
     verdict = None
     if chosen.has_reference:
-        verdict = judge([draw_statistics(chosen, known, reference)])
-    metrics: Mapping[str, float] = measure(chosen, known, reference)
-    return Score(finished.name, chosen.name, verdict, dict(metrics))
+        verdict = judge([draw_statistics(chosen, known, reference, metrics)])
+    return Score(finished.name, chosen.name, verdict, metrics)
 
 
 def _check_draws(motions: np.ndarray, chosen: Problem) -> None:

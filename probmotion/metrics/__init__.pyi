@@ -29,6 +29,7 @@ from .keypoints import (
 )
 from .measures import measure as measure
 from .motion_chamfer import motion_chamfer_distance as motion_chamfer_distance
+from .run_statistics import DrawStatistics as DrawStatistics, draw_statistics as draw_statistics
 from .stein import kernel_stein_discrepancy as kernel_stein_discrepancy, score_of as score_of
 from .two_sample import (
     classifier_two_sample as classifier_two_sample,
@@ -36,4 +37,4 @@ from .two_sample import (
     maximum_mean_discrepancy as maximum_mean_discrepancy,
 )
 from .uniformity import ecdf_band as ecdf_band, uniformity_p_value as uniformity_p_value
-from .verdict import Verdict as Verdict, draw_statistics as draw_statistics, judge as judge
+from .verdict import Verdict as Verdict, judge as judge

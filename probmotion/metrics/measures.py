@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from probmotion import seeds
-from probmotion.interaction.geometry.coordinates import align_motions
 from probmotion.metrics import accuracy, distribution, keypoints
 from probmotion.metrics.chains import chain_diagnostics
 from probmotion.metrics.generation import GenerationReference, diversity
-from probmotion.metrics.reference_draws import reference_draws
+from probmotion.metrics.run_statistics import compared, reference_draws
 from probmotion.metrics.stein import NoGradient, kernel_stein_discrepancy, score_of
 from probmotion.metrics.two_sample import classifier_two_sample, maximum_mean_discrepancy
 from probmotion.posteriors.draws import MotionDraws
@@ -130,7 +129,7 @@ def _exact_draws(problem: Problem, seed: int, n: int) -> _Exact:
     limit = problem.max_references
     n_sets = min(_MAX_SETS, max(2, _EXACT_DRAWS // n), *([] if limit is None else [limit // n]))
     reference = reference_draws(problem, seed, n_sets * n)[: n_sets * n]
-    flat = _compared(problem, reference)
+    flat = compared(problem, reference)
     rng = seeds.generator(seed, "directions")
     prior = problem.posterior.prior
     return _Exact(
@@ -144,7 +143,7 @@ def _exact_draws(problem: Problem, seed: int, n: int) -> _Exact:
 
 
 def _against_reference(problem: Problem, positions: np.ndarray, seed: int) -> dict[str, float]:
-    flat = _compared(problem, positions)
+    flat = compared(problem, positions)
     # Thin draws to the size of two available reference sets.
     limit = problem.max_references
     n = len(flat) if limit is None else min(len(flat), limit // 2)
@@ -171,13 +170,6 @@ def _against_reference(problem: Problem, positions: np.ndarray, seed: int) -> di
     values["mmd"] = maximum_mean_discrepancy(thinned, exact.sets[0])
     values["c2st"] = classifier_two_sample(thinned, exact.sets[0], seed)
     return values
-
-
-def _compared(problem: Problem, motions: np.ndarray) -> np.ndarray:
-    """Return motions flattened, (n, L J 3), and aligned if the problem requires it."""
-    if problem.aligned_to is not None:
-        motions = align_motions(motions, problem.aligned_to)
-    return motions.reshape(len(motions), -1)
 
 
 def _against_density(problem: Problem, draws: MotionDraws) -> dict[str, float]:

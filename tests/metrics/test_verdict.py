@@ -9,11 +9,14 @@ import pytest
 from sklearn.decomposition import PCA
 
 import probmotion as pm
-from probmotion.metrics.verdict import DrawStatistics, Verdict, draw_statistics, judge
+from probmotion.metrics.chains import chain_diagnostics
+from probmotion.metrics.measures import measure
+from probmotion.metrics.run_statistics import DrawStatistics, draw_statistics
+from probmotion.metrics.verdict import Verdict, judge
 from probmotion.posteriors.draws import MotionDraws
 from probmotion.problems import load_problem
 
-N, REPEATS = 400, 6
+N, REPEATS = 400, 10
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,7 @@ def statistics_of(problem, motions, chains=1, independent=True, seed=0):
         problem.posterior, Sampler(), motions.reshape(shape), seed=0, seconds=0.0,
         independent=independent,
     )  # fmt: skip
-    return draw_statistics(problem, draws, seed)
+    return draw_statistics(problem, draws, seed, chain_diagnostics(draws))
 
 
 def verdict_of(problem, motions, **options) -> Verdict:
@@ -54,7 +57,7 @@ def words(problem, sets):
 
 def test_exact_draws_are_right(gait, monocular):
     found = words(gait, exact_sets(gait)) + words(monocular, exact_sets(monocular))
-    # At a rate of .8, fewer than 8 of 12 sets are right in 7 % of cases.
+    # At a rate of .8, fewer than 13 of 20 sets are right in 3 % of cases.
     assert found["right"] >= 0.65 * 2 * REPEATS, found
     assert found["right"] + found["undecided"] >= 0.93 * 2 * REPEATS, found
 
@@ -80,19 +83,18 @@ def off_manifold(problem, sets):
 
 
 @pytest.mark.parametrize(
-    ("fault", "word", "least"),
-    # A shift of .3 sd is named in nine of ten cases.
-    [(shrunk, "overconfident", 6), (shifted, "biased", 4), (off_manifold, "off the manifold", 6)],
+    ("fault", "word"),
+    [(shrunk, "overconfident"), (shifted, "biased"), (off_manifold, "off the manifold")],
 )
-def test_a_fault_is_named(monocular, fault, word, least):
+def test_a_fault_is_named(monocular, fault, word):
     found = words(monocular, fault(monocular, exact_sets(monocular)))
-    assert found[word] >= least, found
+    assert found[word] >= 0.9 * REPEATS, found
 
 
 def test_a_missing_mode_is_named(gait):
     prior = gait.posterior.prior
     lost = []
-    for motions in exact_sets(gait, repeats=3, n=600):
+    for motions in exact_sets(gait, repeats=5, n=600):
         style = prior.style_responsibilities(motions).argmax(axis=1)
         lost.append(motions[style != 0][:N])
     verdicts = [verdict_of(gait, motions) for motions in lost]
@@ -108,6 +110,23 @@ def test_few_draws_are_undecided_and_the_required_number_is_reported(monocular):
     assert 50 < needed < 5000
     assert not verdict.is_right
     assert not verdict.is_wrong
+
+
+def test_few_independent_draws_are_not_right(monocular):
+    sets = [statistics_of(monocular, motions) for motions in exact_sets(monocular, 20, 40)]
+    assert not any(judge([run]).is_right for run in sets)
+    # The accuracy of a classifier of 40 draws is not normal: it called a third of pairs wrong.
+    assert sum(judge(sets[i : i + 2]).is_wrong for i in range(0, 20, 2)) <= 1
+
+
+def test_metrics_of_a_run_save_their_computation(gait):
+    draws = pm.sample(gait, "mh", draws=200, progress=False)
+    exact = pm.sample(gait, "exact", draws=200, progress=False)
+    for given in (draws, exact):
+        metrics = measure(gait, given, 3)
+        saved = draw_statistics(gait, given, 3, metrics)
+        assert saved == draw_statistics(gait, given, 3, chain_diagnostics(given))
+    assert saved.classifier[0] == metrics["c2st"]
 
 
 def test_seeds_are_pooled(monocular):
@@ -138,7 +157,7 @@ def test_chains_that_disagree_are_not_mixed(gait):
 def test_a_wrong_sampler_is_not_right(name, sampler, settings, fault, request):
     problem = request.getfixturevalue(name)
     draws = pm.sample(problem, sampler, draws=200, progress=False, **settings)
-    verdict = judge([draw_statistics(problem, draws, 0)])
+    verdict = pm.score(problem, draws).verdict
     assert verdict.is_wrong
     assert fault in verdict.sentence
 
@@ -149,4 +168,4 @@ def test_a_wrong_sampler_is_never_right(name, sampler):
     problem = load_problem(name)
     for seed in range(3):
         draws = pm.sample(problem, sampler, draws=N, seed=seed, progress=False)
-        assert judge([draw_statistics(problem, draws, seed)]).is_wrong
+        assert pm.score(problem, draws, seed=seed).verdict.is_wrong

@@ -19,7 +19,8 @@ from probmotion.comparison.results.run_results import (
 )
 from probmotion.comparison.results.summary import summary, verdict_text
 from probmotion.files import written_whole
-from probmotion.metrics.verdict import DrawStatistics, Verdict, judge
+from probmotion.metrics.run_statistics import DrawStatistics
+from probmotion.metrics.verdict import Verdict, judge
 from probmotion.posteriors.draws import MotionDraws
 
 if TYPE_CHECKING:

@@ -24,7 +24,7 @@ class RunResult:
 
     ``budget`` contains the budget as text, the chosen settings and the amount used;
     ``draws_bytes`` is the size of the draws file, and ``statistics`` are those of a verdict
-    (:class:`~probmotion.metrics.verdict.DrawStatistics`), absent without reference draws.
+    (:class:`~probmotion.metrics.DrawStatistics`), absent without reference draws.
     """
 
     problem: str

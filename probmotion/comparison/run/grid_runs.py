@@ -99,7 +99,7 @@ class GridRun(GridTask):
         self, problem: Problem
     ) -> tuple[MotionDraws, dict[str, float], dict[str, Any] | None]:
         from probmotion.metrics.measures import measure
-        from probmotion.metrics.verdict import draw_statistics
+        from probmotion.metrics.run_statistics import draw_statistics
 
         # Changing "cell" would change all draws.
         seed = seeds.integer(self.seed, "cell", self.problem, self.sampler)
@@ -110,7 +110,7 @@ class GridRun(GridTask):
         metrics = measure(problem, draws, reference)
         statistics = None
         if problem.has_reference:
-            statistics = draw_statistics(problem, draws, reference).to_json()
+            statistics = draw_statistics(problem, draws, reference, metrics).to_json()
         if peak.mebibytes is not None:
             metrics["peak_memory_mib"] = peak.mebibytes
         return draws, metrics, statistics
