@@ -15,7 +15,7 @@ from probmotion import seeds
 from probmotion.interaction.geometry.coordinates import align_motions
 from probmotion.metrics import distribution
 from probmotion.metrics.chains import rhat_of_independent
-from probmotion.metrics.two_sample import classifier_two_sample
+from probmotion.metrics.two_sample import accuracy_sd, classifier_two_sample
 from probmotion.posteriors.draws import MotionDraws
 from probmotion.posteriors.problem import Problem
 from probmotion.posteriors.protocols import HasManifold, HasStyles
@@ -159,7 +159,7 @@ def draw_statistics(
         accuracy = metrics.get("c2st") if size == total else None
         if accuracy is None:
             accuracy = classifier_two_sample(flat[rows], reference.flat[:size], seed)
-        classifier = [accuracy, 1 / math.sqrt(8 * size)]
+        classifier = [accuracy, accuracy_sd(size)]
     rhat, sizes = metrics.get("rhat"), draws.dataset.sizes
     return DrawStatistics(
         digest=blake2b(np.ascontiguousarray(positions).tobytes(), digest_size=8).hexdigest(),

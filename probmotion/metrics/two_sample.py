@@ -13,6 +13,7 @@ from probmotion import seeds
 from probmotion.validation import check_count, check_finite, check_positive, check_shape
 
 __all__ = [
+    "accuracy_sd",
     "classifier_two_sample",
     "discrepancy_p_value",
     "maximum_mean_discrepancy",
@@ -135,6 +136,16 @@ def classifier_two_sample(draws: np.ndarray, reference: np.ndarray, seed: int) -
     random_state = seeds.integer(seed, "folds") % 2**32
     folds = StratifiedKFold(_FOLDS, shuffle=True, random_state=random_state)
     return float(cross_val_score(SVC(), features, labels, cv=folds).mean())
+
+
+def accuracy_sd(n: int) -> float:
+    """Return the standard deviation of :func:`classifier_two_sample` for equal laws, n draws each.
+
+    Folds share training points, so that accuracies of folds are correlated. Their mean has the
+    binomial variance 1/(8n) times 1 + K/(K − 1), with K folds (Nadeau and Bengio 2003, "Inference
+    for the generalization error"), an approximation that errs on the side of too much.
+    """
+    return math.sqrt((1 + _FOLDS / (_FOLDS - 1)) / (8 * n))
 
 
 def principal_coordinates(points: np.ndarray, max_coordinates: int) -> np.ndarray:

@@ -149,7 +149,7 @@ def judge(statistics: Sequence[DrawStatistics]) -> Verdict:
         deviation /= math.sqrt(len(statistics))
         quantities.append(_classifier_quantity(accuracy, deviation, n))
     else:
-        # The null distribution of the accuracy is not normal for fewer draws.
+        # Fewer draws do not suffice to be shown right.
         unknown = Quantity(
             "classifier", math.nan, 0.5, _CLASSIFIER_TOLERANCE, 1.0, 1.0, float(MIN_CLASSIFIED)
         )

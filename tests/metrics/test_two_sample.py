@@ -8,6 +8,7 @@ import pytest
 from scipy import stats
 
 from probmotion.metrics.two_sample import (
+    accuracy_sd,
     classifier_two_sample,
     discrepancy_p_value,
     maximum_mean_discrepancy,
@@ -129,6 +130,13 @@ def test_principal_coordinates_are_standardised_and_uncorrelated(rng):
     flat = rng.normal(size=(30, 2)) @ rng.normal(size=(2, 9))
     assert principal_coordinates(flat, 4).shape == (30, 2)
     assert principal_coordinates(rng.normal(size=(30, 3)), 4).shape == (30, 3)
+
+
+def test_the_deviation_of_the_accuracy_includes_the_correlation_of_folds(rng):
+    pairs = rng.normal(size=(80, 2, 100, 5))
+    accuracies = [classifier_two_sample(*pair, seed=0) for pair in pairs]
+    # The standard error of the ratio is .08; 1/√(8n) alone would give 1.3.
+    assert 0.7 < np.std(accuracies) / accuracy_sd(100) < 1.1
 
 
 GOOD = np.random.default_rng(0).normal(size=(8, 3))
