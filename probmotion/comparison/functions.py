@@ -19,6 +19,7 @@ from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.problem import Problem
 from probmotion.posteriors.protocols import Likelihood, MotionPrior
 from probmotion.problems.catalogue import load_problem
+from probmotion.threads import one_thread
 from probmotion.validation import check_count, check_shape
 
 __all__ = ["Score", "posterior", "problem", "sample", "score"]
@@ -150,10 +151,12 @@ def score(target: AnyProblem, draws: Any, *, seed: int = 0) -> Score:
     known = draws if isinstance(draws, MotionDraws) else finished.sample(chosen.posterior)
     _check_draws(known.flat(), chosen)
     reference = seeds.integer(seed, "exact", chosen.name)
-    metrics = measure(chosen, known, reference)
     verdict = None
-    if chosen.has_reference:
-        verdict = judge([draw_statistics(chosen, known, reference, metrics)])
+    # As in a comparison; several threads are not faster for matrices of this size.
+    with one_thread():
+        metrics = measure(chosen, known, reference)
+        if chosen.has_reference:
+            verdict = judge([draw_statistics(chosen, known, reference, metrics)])
     return Score(finished.name, chosen.name, verdict, metrics)
 
 

@@ -33,12 +33,9 @@ def sliced_wasserstein(x: Array, y: Array, directions: np.ndarray) -> Array:
     ``(n, D), (n, D) → ()``, in any array library: the root mean square of the 2-Wasserstein
     distances between projections onto ``directions`` (P, D).
     """
-    xp = array_namespace(x, y)
     check_shape("x", x, ("n", directions.shape[-1]))
     check_shape("y", y, tuple(x.shape))
-    axes = constant(directions.T, x)
-    differences = xp.sort(x @ axes, axis=0) - xp.sort(y @ axes, axis=0)
-    return xp.sqrt(xp.mean(differences**2))
+    return _root_mean_square(_projections(x, directions) - _projections(y, directions))
 
 
 def sliced_wasserstein_ratio(
@@ -59,10 +56,24 @@ def sliced_wasserstein_ratio(
     """
     if len(references) < 2:
         raise ValueError(f"references must have at least 2 sets, got {len(references)}")
-    pairs = zip(references, [*references[1:], references[0]], strict=True)
-    floor = np.mean([float(sliced_wasserstein(a, b, directions)) for a, b in pairs])
-    distance = np.mean([float(sliced_wasserstein(draws, r, directions)) for r in references])
+    for name, points in (("draws", draws), *(("references", r) for r in references)):
+        check_shape(name, points, (len(draws), directions.shape[-1]))
+    own, *sets = (_projections(points, directions) for points in (draws, *references))
+    pairs = zip(sets, [*sets[1:], sets[0]], strict=True)
+    floor = np.mean([float(_root_mean_square(a - b)) for a, b in pairs])
+    distance = np.mean([float(_root_mean_square(own - b)) for b in sets])
     return float(distance / floor)
+
+
+def _projections(points: Array, directions: np.ndarray) -> Array:
+    """Return projections onto directions, each sorted: ``(n, D), (P, D) → (n, P)``."""
+    xp = array_namespace(points)
+    return xp.sort(points @ constant(directions.T, points), axis=0)
+
+
+def _root_mean_square(differences: Array) -> Array:
+    xp = array_namespace(differences)
+    return xp.sqrt(xp.mean(differences**2))
 
 
 def trace_ratio(draws: Array, reference: Array) -> Array:

@@ -14,12 +14,12 @@ from probmotion import seeds
 from probmotion.metrics import accuracy, distribution, keypoints
 from probmotion.metrics.chains import chain_diagnostics
 from probmotion.metrics.generation import GenerationReference, diversity
-from probmotion.metrics.run_statistics import compared, reference_draws
+from probmotion.metrics.run_statistics import Features, reference_draws
 from probmotion.metrics.stein import NoGradient, kernel_stein_discrepancy, score_of
 from probmotion.metrics.two_sample import classifier_two_sample, maximum_mean_discrepancy
 from probmotion.posteriors.draws import MotionDraws
 from probmotion.posteriors.likelihoods import Keypoints2D
-from probmotion.posteriors.protocols import HasManifold, HasStyles
+from probmotion.posteriors.protocols import HasStyles
 
 if TYPE_CHECKING:
     from probmotion.posteriors.posterior import MotionPosterior
@@ -128,40 +128,39 @@ class _Exact:
 def _exact_draws(problem: Problem, seed: int, n: int) -> _Exact:
     limit = problem.max_references
     n_sets = min(_MAX_SETS, max(2, _EXACT_DRAWS // n), *([] if limit is None else [limit // n]))
-    reference = reference_draws(problem, seed, n_sets * n)[: n_sets * n]
-    flat = compared(problem, reference)
+    reference, used = reference_draws(problem, seed, n_sets * n), n_sets * n
+    flat = reference.flat[:used]
     rng = seeds.generator(seed, "directions")
-    prior = problem.posterior.prior
     return _Exact(
         sets=np.split(flat, n_sets),
         flat=flat,
         directions=distribution.random_directions(rng, _DIRECTIONS, flat.shape[1]),
-        off=_off_manifold(prior, reference),
-        log_density=_log_density(problem, reference),
-        mode_proportions=_mode_proportions(prior, reference),
+        off=_off_manifold(reference, used),
+        log_density=_log_density(problem, reference.positions[:used]),
+        mode_proportions=_mode_proportions(reference, used),
     )
 
 
 def _against_reference(problem: Problem, positions: np.ndarray, seed: int) -> dict[str, float]:
-    flat = compared(problem, positions)
+    draws = Features(problem, positions)
+    flat = draws.flat
     # Thin draws to the size of two available reference sets.
     limit = problem.max_references
     n = len(flat) if limit is None else min(len(flat), limit // 2)
     thinned = flat[np.arange(n) * len(flat) // n]
     exact = _exact_draws(problem, seed, n)
-    prior = problem.posterior.prior
     values = {
         "swd_ratio": distribution.sliced_wasserstein_ratio(thinned, exact.sets, exact.directions),
         "variance_ratio": float(distribution.trace_ratio(flat, exact.flat)),
         "mean_error_sd": float(distribution.mean_error(flat, exact.flat)),
     }
-    off_manifold = _off_manifold(prior, positions)
+    off_manifold = _off_manifold(draws)
     if off_manifold is not None and exact.off is not None:
         values["off_manifold_ratio"] = off_manifold / exact.off
     log_density = _log_density(problem, positions)
     if log_density is not None and exact.log_density is not None:
         values["log_density_gap"] = log_density - exact.log_density
-    proportions = _mode_proportions(prior, positions)
+    proportions = _mode_proportions(draws)
     if proportions:
         values |= {f"mode_proportion_{style}": p for style, p in proportions.items()}
         differences = [abs(p - exact.mode_proportions[style]) for style, p in proportions.items()]
@@ -215,10 +214,9 @@ def _against_real_views(
     return values
 
 
-def _off_manifold(prior: object, positions: np.ndarray) -> float | None:
-    if not isinstance(prior, HasManifold):
-        return None
-    return float(prior.off_manifold(positions).mean())
+def _off_manifold(draws: Features, used: int | None = None) -> float | None:
+    values = draws.off_manifold
+    return None if values is None else float(values[:used].mean())
 
 
 def _log_density(problem: Problem, positions: np.ndarray) -> float | None:
@@ -226,10 +224,11 @@ def _log_density(problem: Problem, positions: np.ndarray) -> float | None:
     return None if value is None else float(np.mean(value))
 
 
-def _mode_proportions(prior: object, positions: np.ndarray) -> dict[str, float]:
-    if not isinstance(prior, HasStyles):
+def _mode_proportions(draws: Features, used: int | None = None) -> dict[str, float]:
+    prior = draws.problem.posterior.prior
+    if not isinstance(prior, HasStyles) or draws.proportions is None:
         return {}
-    proportions = prior.style_responsibilities(positions).mean(axis=0)
+    proportions = draws.proportions[:used].mean(axis=0)
     return {style: float(p) for style, p in zip(prior.styles, proportions, strict=True)}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from hashlib import blake2b
 from typing import Any
 
@@ -24,7 +24,7 @@ __all__ = [
     "MIN_CLASSIFIED",
     "N_SETS",
     "DrawStatistics",
-    "compared",
+    "Features",
     "draw_statistics",
     "reference_draws",
 ]
@@ -41,25 +41,55 @@ _N_PROJECTIONS = 128
 _MAX_CLASSIFIED = 400
 
 
-def reference_draws(problem: Problem, seed: int, at_least: int = 0) -> np.ndarray:
-    """Return 4000 reference draws, or ``at_least`` if that is more, (n, L, J, 3), metres.
+@dataclass(frozen=True, eq=False)
+class Features:
+    """Features of draws of a problem, each computed once.
 
-    There are fewer if fewer are stored.
+    Parameters
+    ----------
+    problem : Problem
+        Problem that was sampled.
+    positions : ndarray, (n, L, J, 3)
+        The draws, metres.
     """
+
+    problem: Problem
+    positions: np.ndarray
+
+    @cached_property
+    def flat(self) -> np.ndarray:
+        """Motions flattened, (n, L J 3), and aligned if the problem requires it."""
+        motions = self.positions
+        if self.problem.aligned_to is not None:
+            motions = align_motions(motions, self.problem.aligned_to)
+        return motions.reshape(len(motions), -1)
+
+    @cached_property
+    def off_manifold(self) -> np.ndarray | None:
+        """Variance off the prior's manifold, (n,), if there is one."""
+        prior = self.problem.posterior.prior
+        if not isinstance(prior, HasManifold):
+            return None
+        return np.asarray(prior.off_manifold(self.positions))
+
+    @cached_property
+    def proportions(self) -> np.ndarray | None:
+        """Probability of each style, (n, K), if there are any."""
+        prior = self.problem.posterior.prior
+        if not isinstance(prior, HasStyles):
+            return None
+        return np.asarray(prior.style_responsibilities(self.positions))
+
+
+def reference_draws(problem: Problem, seed: int, at_least: int = 0) -> Features:
+    """Return 4000 reference draws, or ``at_least`` if that is more; fewer if fewer are stored."""
     n, most = max(_N_REFERENCES, at_least), problem.max_references
     return _drawn(problem, seed, n if most is None else min(n, most))
 
 
 @lru_cache(maxsize=2)
-def _drawn(problem: Problem, seed: int, n: int) -> np.ndarray:
-    return problem.reference(seed, n)
-
-
-def compared(problem: Problem, motions: np.ndarray) -> np.ndarray:
-    """Return motions flattened, (n, L J 3), and aligned if the problem requires it."""
-    if problem.aligned_to is not None:
-        motions = align_motions(motions, problem.aligned_to)
-    return motions.reshape(len(motions), -1)
+def _drawn(problem: Problem, seed: int, n: int) -> Features:
+    return Features(problem, problem.reference(seed, n))
 
 
 @dataclass(frozen=True)
@@ -128,29 +158,29 @@ def draw_statistics(
         :func:`~probmotion.metrics.chains.chain_diagnostics`; ``c2st`` saves its computation.
     """
     reference = _reference(problem, seed)
-    positions = draws.flat()
-    total = len(positions)
+    exact = reference.draws
+    own = Features(problem, draws.flat())
+    flat = own.flat
+    total = len(flat)
     n = min(total, metrics.get("ess_bulk", total))
-    m = len(reference.flat)
-    flat = compared(problem, positions)
+    m = len(exact.flat)
     leading = (flat @ reference.directions.T - reference.mean) / reference.sd
     spread = np.atleast_2d(np.cov(leading.T)) + n / m * reference.correlation
     ratios = {}
-    for name, values in _positive(problem, flat, positions, leading).items():
+    for name, values in _positive(own, leading).items():
         against = reference.positive[name]
         ratios[name] = [
             math.log(values.mean() / against.mean()),
             _relative_variance(values) + n / len(against) * _relative_variance(against),
         ]
-    proportions = _responsibilities(problem, positions)
     modes, modes_spread = {}, []
-    if proportions is not None and reference.proportions is not None:
+    if own.proportions is not None and exact.proportions is not None:
         prior = problem.posterior.prior
         assert isinstance(prior, HasStyles)
-        own, true = proportions.mean(axis=0), reference.proportions.mean(axis=0)
-        named = zip(prior.styles, own, true, strict=True)
+        means = own.proportions.mean(axis=0), exact.proportions.mean(axis=0)
+        named = zip(prior.styles, *means, strict=True)
         modes = {str(name): [float(a), float(b)] for name, a, b in named}
-        covariance = np.cov(proportions.T) + n / m * np.cov(reference.proportions.T)
+        covariance = np.cov(own.proportions.T) + n / m * np.cov(exact.proportions.T)
         modes_spread = np.atleast_2d(covariance).tolist()
     size = min(int(n), m, _MAX_CLASSIFIED)
     rows = np.arange(size) * total // size
@@ -158,11 +188,11 @@ def draw_statistics(
     if size >= MIN_CLASSIFIED:
         accuracy = metrics.get("c2st") if size == total else None
         if accuracy is None:
-            accuracy = classifier_two_sample(flat[rows], reference.flat[:size], seed)
+            accuracy = classifier_two_sample(flat[rows], exact.flat[:size], seed)
         classifier = [accuracy, accuracy_sd(size)]
     rhat, sizes = metrics.get("rhat"), draws.dataset.sizes
     return DrawStatistics(
-        digest=blake2b(np.ascontiguousarray(positions).tobytes(), digest_size=8).hexdigest(),
+        digest=blake2b(np.ascontiguousarray(own.positions).tobytes(), digest_size=8).hexdigest(),
         n=float(n),
         m=float(m),
         mean=leading.mean(axis=0).tolist(),
@@ -179,69 +209,59 @@ def draw_statistics(
 
 @dataclass(frozen=True, eq=False)
 class _Reference:
-    """Features of reference draws.
+    """Reference draws in their principal directions.
 
     Variance along the directions comes from held-out draws, since that of the draws from which
     directions are estimated is too large.
     """
 
-    flat: np.ndarray
+    draws: Features
     directions: np.ndarray
     mean: np.ndarray
     sd: np.ndarray
     correlation: np.ndarray
     positive: dict[str, np.ndarray]
-    proportions: np.ndarray | None
 
 
 @lru_cache(maxsize=4)
 def _reference(problem: Problem, seed: int) -> _Reference:
     from sklearn.decomposition import PCA
 
-    positions = reference_draws(problem, seed)
-    flat = compared(problem, positions)
+    draws = reference_draws(problem, seed)
+    flat = draws.flat
     chosen, held_out = np.split(flat, [int(_DIRECTION_FRACTION * len(flat))])
     directions = PCA(min(_N_LEADING, *chosen.shape), random_state=0).fit(chosen).components_
     projected = held_out @ directions.T
     mean, sd = projected.mean(axis=0), projected.std(axis=0, ddof=1)
     return _Reference(
-        flat=flat,
+        draws=draws,
         directions=directions,
         mean=(flat @ directions.T).mean(axis=0),
         sd=sd,
         correlation=np.atleast_2d(np.corrcoef(projected.T)),
-        positive=_positive(problem, flat, positions, (projected - mean) / sd),
-        proportions=_responsibilities(problem, positions),
+        positive=_positive(draws, (projected - mean) / sd),
     )
 
 
-def _positive(
-    problem: Problem, flat: np.ndarray, positions: np.ndarray, leading: np.ndarray
-) -> dict[str, np.ndarray]:
+def _positive(features: Features, leading: np.ndarray) -> dict[str, np.ndarray]:
     """Return positive values per draw, (n,), whose means are compared as ratios."""
     apart = (leading - leading.mean(axis=0)) ** 2
     level = apart.mean(axis=0)
     # The mean is the geometric mean of the variances; deviations are those of their logarithm.
     geometric = math.exp(np.log(level).mean())
+    flat = features.flat
     values = {
         "variance": _unbiased(((flat - flat.mean(axis=0)) ** 2).sum(axis=1)),
         "leading variance": _unbiased(geometric * (apart / level).mean(axis=1)),
     }
-    if isinstance(problem.posterior.prior, HasManifold):
-        values["off-manifold"] = np.asarray(problem.posterior.prior.off_manifold(positions))
+    if features.off_manifold is not None:
+        values["off-manifold"] = features.off_manifold
     return values
 
 
 def _unbiased(squares: np.ndarray) -> np.ndarray:
     """Return squared deviations from the mean of n draws, times n/(n − 1)."""
     return squares * len(squares) / (len(squares) - 1)
-
-
-def _responsibilities(problem: Problem, positions: np.ndarray) -> np.ndarray | None:
-    prior = problem.posterior.prior
-    if not isinstance(prior, HasStyles):
-        return None
-    return np.asarray(prior.style_responsibilities(positions))
 
 
 def _relative_variance(values: np.ndarray) -> float:
@@ -264,7 +284,7 @@ def _distances_of_sets(
     problem: Problem, seed: int, size: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Return sorted projections of reference sets, directions, and mean distances of each set."""
-    flat = _reference(problem, seed).flat
+    flat = reference_draws(problem, seed).flat
     if size < 2 or len(flat) < N_SETS * size:
         return None
     rng = seeds.generator(seed, "verdict directions")

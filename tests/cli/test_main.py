@@ -53,7 +53,7 @@ def test_version(capsys):
     assert capsys.readouterr().out == f"probmotion {probmotion.__version__}\n"
 
 
-COMMANDS = ["compare", "report", "list", "show", "convert", "reference", "which"]
+COMMANDS = ["compare", "report", "list", "show", "convert", "denoise", "reference", "which"]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -212,9 +212,10 @@ def test_calibration_within_a_budget_resumes(tmp_path, capsys):
 
 @pytest.mark.parametrize("workers", ["0", "2"])
 def test_interrupted_comparison_keeps_finished_runs(workers, tmp_path, interrupted):
-    words = f"compare gait --samplers exact mas --draws 40 --out {tmp_path}".split()
+    problem = "gait(frames=4)"
+    words = f"compare {problem} --samplers exact mas --draws 40 --out {tmp_path}".split()
     long = ["--settings.mas.steps", "1000000", "--workers", workers]
-    stored = tmp_path / "runs" / "gait" / "exact" / "0"
+    stored = tmp_path / "runs" / problem / "exact" / "0"
     message = interrupted([*words, *long], stored)
     assert "1 of 2 runs finished" in message
     assert str(tmp_path) in message
