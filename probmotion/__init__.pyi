@@ -13,10 +13,15 @@ from .geometry.triangulation import triangulate as triangulate
 from .io.files import (
     load as load,
     load_all as load_all,
+    read_joints as read_joints,
     read_keypoints as read_keypoints,
     save as save,
 )
-from .motion.motion import KeypointTrack as KeypointTrack, Motion as Motion
+from .motion.motion import (
+    JointTrack as JointTrack,
+    KeypointTrack as KeypointTrack,
+    Motion as Motion,
+)
 from .motion.skeleton import Skeleton as Skeleton
 from .posteriors.draws import MotionDraws as MotionDraws
 from .posteriors.likelihoods import Joints3D as Joints3D, Keypoints2D as Keypoints2D

@@ -11,7 +11,8 @@ from pathlib import Path
 from unittest import mock
 
 _COMMANDS = (
-    ("compare",), ("report",), ("which",), ("list",), ("show",), ("convert",), ("reference",),
+    ("compare",), ("report",), ("which",), ("list",), ("show",), ("convert",), ("denoise",),
+    ("reference",),
     ("train", "diffusion"), ("train", "evaluator"), ("train", "lifter"), ("train", "dvae"),
     ("train", "denoiser"), ("train", "motion-vae"),
 )  # fmt: skip

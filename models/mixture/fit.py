@@ -80,12 +80,12 @@ def fit_styles(
 
 
 def cut_windows(
-    motions: Sequence[Motion], frames: int, stride: int | None = None
+    motions: Sequence[Motion], frames: int, stride: int | None = None, *, centred: bool = True
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return all windows of clips, centred on the root, (n, frames, J, 3), and clip indices (n,).
+    """Return all windows of clips, (n, frames, J, 3), and clip indices (n,).
 
     ``stride`` is the number of frames between window starts, by default ``frames // 4``. Clips
-    shorter than ``frames`` are skipped.
+    shorter than ``frames`` are skipped. With ``centred``, the root's mean position is the origin.
 
     Raises
     ------
@@ -111,7 +111,8 @@ def cut_windows(
     windows, clip_of = [], []
     for clip, motion in enumerate(motions):
         for start in range(0, motion.frames - frames + 1, step):
-            windows.append(motion.window(start, frames).centred().positions)
+            window = motion.window(start, frames)
+            windows.append((window.centred() if centred else window).positions)
             clip_of.append(clip)
     if not windows:
         longest = max(motion.frames for motion in motions)

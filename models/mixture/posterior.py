@@ -18,7 +18,7 @@ from probmotion.models.mixture.rotated_mixture import rotation_coefficients
 from probmotion.posteriors.protocols import Likelihood, NotConjugate
 from probmotion.seeds import RandomNumbers
 
-__all__ = ["MixturePosterior"]
+__all__ = ["MixturePosterior", "natural_parameters"]
 
 
 class MixturePosterior:
@@ -42,7 +42,7 @@ class MixturePosterior:
         self.noise = noise
         self._fields = base_fields
         self._turns = rotation_coefficients(azimuths)
-        self.information, self.shift, constant_part = _natural_parameters(
+        self.information, self.shift, constant_part = natural_parameters(
             likelihood, base_fields.shape[3]
         )
         variance = noise**2
@@ -208,7 +208,7 @@ class MixturePosterior:
         return out.reshape(n, *self.shape)
 
 
-def _natural_parameters(
+def natural_parameters(
     likelihood: Likelihood | None, F: int
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return Λ (F, 3, 3), η (F, 3) and the terms of log p(y | X) that do not depend on X."""

@@ -1,4 +1,5 @@
 from .compare import Compare as Compare
+from .denoise import Denoise as Denoise
 from .files import Convert as Convert, Show as Show
 from .main import List as List
 from .reference import Reference as Reference

@@ -15,6 +15,7 @@ from importlib.metadata import version
 from typing import Any
 
 from probmotion.cli.compare import Compare
+from probmotion.cli.denoise import Denoise
 from probmotion.cli.files import Convert, Report, Show
 from probmotion.cli.reference import Reference
 from probmotion.cli.which import Which
@@ -32,6 +33,7 @@ commands:
   list       list the named problems, samplers and skeletons
   show       summarise a file, or a network, sampler or problem by name
   convert    convert a motion to another format, frame rate or skeleton
+  denoise    denoise recorded 3D joints and fill gaps
   train      train a prior, or a network for evaluating priors
   reference  generate certified reference draws of a problem
 
@@ -81,7 +83,7 @@ def _first_line(kind: Any) -> str:
 
 _COMMANDS: dict[str, type[Any]] = {
     "compare": Compare, "report": Report, "which": Which, "list": List, "show": Show,
-    "convert": Convert, "reference": Reference,
+    "convert": Convert, "denoise": Denoise, "reference": Reference,
 }  # fmt: skip
 
 

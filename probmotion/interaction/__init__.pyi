@@ -6,6 +6,10 @@ from .completion import (
     nearest_annotation_completion as nearest_annotation_completion,
     occluded_joint_error as occluded_joint_error,
 )
+from .regression import (
+    RidgeCompletion as RidgeCompletion,
+    ridge_completion as ridge_completion,
+)
 from .retrieval import (
     RetrievalResult as RetrievalResult,
     retrieve as retrieve,

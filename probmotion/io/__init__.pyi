@@ -8,11 +8,14 @@ from .files import (
     files_named as files_named,
     load as load,
     load_all as load_all,
+    read_joints as read_joints,
     read_keypoints as read_keypoints,
     save as save,
 )
 from .keypoint_json import read_keypoint_json as read_keypoint_json
+from .markers import read_c3d as read_c3d, read_trc as read_trc
 from .npz import (
+    read_joint_npz as read_joint_npz,
     read_keypoint_npz as read_keypoint_npz,
     read_npz as read_npz,
     write_npz as write_npz,

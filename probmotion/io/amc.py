@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from probmotion.geometry.rotations import euler_to_matrix
-from probmotion.io.acclaim_text import AcclaimText
-from probmotion.io.asf import AcclaimSkeleton, read_asf
+from probmotion.io.asf import AcclaimSkeleton, AcclaimText, read_asf
 from probmotion.io.errors import shortened
 from probmotion.motion.motion import Motion
 from probmotion.validation import check_positive

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from probmotion.io.errors import MotionFileError, MotionFileWarning
-from probmotion.motion.motion import Motion
+from probmotion.motion.motion import JointTrack, Motion
 from probmotion.motion.plausibility import body_size, is_mirrored, stands_along
 
 __all__ = [
@@ -19,6 +19,7 @@ __all__ = [
     "check_sides",
     "check_size",
     "check_up",
+    "gaps_filled",
     "in_metres",
     "reflected",
     "y_up",
@@ -70,6 +71,25 @@ def reflected(motion: Motion) -> Motion:
         rotations=None if rotations is None else mirror @ rotations @ mirror,
         rest_offsets=None if offsets is None else offsets @ mirror,
     )
+
+
+def gaps_filled(track: JointTrack) -> Motion:
+    """Return a crude motion without gaps, for the checks below.
+
+    Gaps are interpolated linearly in time; a joint never seen is the mean of its neighbours.
+    """
+    joints, seen, skeleton = track.joints.copy(), track.seen, track.skeleton
+    known = [joint for joint in range(skeleton.n_joints) if seen[:, joint].any()]
+    time = np.arange(track.frames)
+    for joint in known:
+        at = seen[:, joint]
+        for axis in range(3):
+            joints[:, joint, axis] = np.interp(time, time[at], joints[at, joint, axis])
+    for joint in set(range(skeleton.n_joints)) - set(known):
+        adjacent = [sum(bone) - joint for bone in skeleton.bones if joint in bone]
+        neighbours = [other for other in adjacent if other in known] or known
+        joints[:, joint] = joints[:, neighbours].mean(axis=1)
+    return Motion(joints, skeleton, track.fps, name=track.name)
 
 
 def check_size(motion: Motion, path: Path) -> None:

@@ -1,9 +1,10 @@
-"""Loading and saving of motions and keypoint tracks, in a format chosen by the file's suffix."""
+"""Loading and saving of motions and tracks, in a format chosen by the file's suffix."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from glob import glob, has_magic
 from pathlib import Path
 
@@ -12,9 +13,11 @@ from probmotion.io.bvh import read_bvh
 from probmotion.io.bvh_writing import write_bvh
 from probmotion.io.conventions import (
     UNITS,
+    Z_UP_TO_Y_UP,
     check_sides,
     check_size,
     check_up,
+    gaps_filled,
     in_metres,
     reflected,
     y_up,
@@ -22,11 +25,12 @@ from probmotion.io.conventions import (
 from probmotion.io.deeplabcut import read_deeplabcut
 from probmotion.io.errors import MotionFileError, MotionFileWarning
 from probmotion.io.keypoint_json import read_keypoint_json
-from probmotion.io.npz import Archive, read_keypoint_npz, read_npz, write_npz
-from probmotion.motion.motion import KeypointTrack, Motion
+from probmotion.io.markers import read_c3d, read_trc
+from probmotion.io.npz import Archive, read_joint_npz, read_keypoint_npz, read_npz, write_npz
+from probmotion.motion.motion import JointTrack, KeypointTrack, Motion
 from probmotion.motion.skeleton import Skeleton
 
-__all__ = ["files_named", "load", "load_all", "read_keypoints", "save"]
+__all__ = ["files_named", "load", "load_all", "read_joints", "read_keypoints", "save"]
 
 
 def load(
@@ -75,9 +79,7 @@ def load(
         right; see :func:`read_bvh`, :func:`read_amc` and :func:`~probmotion.io.npz.read_npz`.
     """
     path = Path(path)
-    for name, value, known in (("unit", unit, [*UNITS]), ("up", up, ["y", "z"])):
-        if value is not None and value not in known:
-            raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
+    _check_conventions(unit, up)
     suffix, declared = path.suffix.lower(), False
     if suffix == ".npz":
         motion = read_npz(path, up)
@@ -101,7 +103,7 @@ def load(
     else:
         raise MotionFileError(
             f"{path}: suffix must be .bvh, .npz or .amc, got {path.suffix!r}; use "
-            "read_keypoints for 2D keypoints"
+            "read_joints for .trc and .c3d, read_keypoints for 2D keypoints"
         )
     if unit is None:
         check_size(motion, path)
@@ -114,6 +116,76 @@ def load(
     else:
         check_sides(motion, path)
     return motion if fps is None else motion.resample(fps)
+
+
+def read_joints(
+    path: str | Path,
+    *,
+    unit: str | None = None,
+    up: str | None = None,
+    mirror: bool = False,
+) -> JointTrack:
+    """Read the 3D joints of one person, with gaps.
+
+    Parameters
+    ----------
+    path : str or Path
+        A ``.npz`` file of :mod:`~probmotion.io.npz` with NaN where joints are missing, a ``.trc``
+        or ``.c3d`` file of joint centres (:mod:`~probmotion.io.markers`), or a file of
+        :func:`load`.
+    unit : str, optional
+        Unit of lengths, ``m``, ``cm``, ``mm`` or ``in``. By default, that declared by a ``.trc`` or
+        ``.c3d`` file, and otherwise as for :func:`load`.
+    up, mirror
+        As for :func:`load`.
+
+    Returns
+    -------
+    track : JointTrack
+        Joints in metres, Y up: of the file's skeleton, or ``person14`` for ``.trc`` and ``.c3d``.
+
+    Raises
+    ------
+    MotionFileError, FileNotFoundError, ValueError
+        As for :func:`load`; also if a file contains several people or lacks joints of ``person14``.
+
+    Warns
+    -----
+    MotionFileWarning
+        As for :func:`load`.
+    """
+    path = Path(path)
+    _check_conventions(unit, up)
+    suffix = path.suffix.lower()
+    declared = False
+    if suffix == ".npz":
+        track = read_joint_npz(path, up)
+        declared = "up_axis" in Archive(path).keys
+        joints = track.joints * UNITS[unit or "m"]
+    elif suffix in (".trc", ".c3d"):
+        track = read_trc(path, unit) if suffix == ".trc" else read_c3d(path, unit)
+        joints = track.joints @ Z_UP_TO_Y_UP.T if up == "z" else track.joints
+    else:
+        motion = load(path, unit=unit, up=up, mirror=mirror)
+        return JointTrack(motion.positions, motion.skeleton, motion.fps, motion.name)
+    if mirror:
+        joints = joints * [-1.0, 1.0, 1.0]
+    track = replace(track, joints=joints)
+    filled = gaps_filled(track)
+    if unit is None:
+        check_size(filled, path)
+    if up is None and not declared:
+        check_up(filled, path)
+    if not mirror:
+        check_sides(filled, path)
+    return track
+
+
+def _check_conventions(unit: str | None, up: str | None) -> None:
+    """Raise ``ValueError`` if a unit or axis is unknown."""
+    for name, value, known in (("unit", unit, [*UNITS]), ("up", up, ["y", "z"])):
+        if value is not None and value not in known:
+            raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
 
 
 def save(motion: Motion, path: str | Path) -> None:

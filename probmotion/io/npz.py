@@ -26,6 +26,7 @@ from __future__ import annotations
 import io
 import warnings
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -41,11 +42,11 @@ from probmotion.io.errors import (
     read_bytes,
     shortened,
 )
-from probmotion.motion.motion import KeypointTrack, Motion
+from probmotion.motion.motion import JointTrack, KeypointTrack, Motion
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_shape
 
-__all__ = ["Archive", "read_keypoint_npz", "read_npz", "write_npz"]
+__all__ = ["Archive", "read_joint_npz", "read_keypoint_npz", "read_npz", "write_npz"]
 
 
 def read_npz(path: str | Path, up: str | None = None) -> Motion:
@@ -84,8 +85,34 @@ def read_npz(path: str | Path, up: str | None = None) -> Motion:
         return motion if turn is None else y_up(motion)
 
 
-def write_npz(motion: Motion, path: str | Path) -> None:
-    """Write a motion to an ``.npz`` archive, losslessly and atomically."""
+def read_joint_npz(path: str | Path, up: str | None = None) -> JointTrack:
+    """Read the joints of one person from an ``.npz`` archive; NaN positions are gaps.
+
+    Axes are converted as by :func:`read_npz`.
+
+    Raises
+    ------
+    MotionFileError
+        If the file has another format, is damaged, or contains several people.
+    """
+    archive = Archive(Path(path))
+    positions = archive.points("positions", "(L, J, 3) or (L, 1, J, 3)")
+    if positions.ndim == 4:
+        if positions.shape[1] > 1:
+            archive.fail(f"positions must be of one person, got {positions.shape[1]} people")
+        positions = positions[:, 0]
+    skeleton, turn = archive.skeleton(positions.shape[1]), archive.turn_to_y_up(up)
+    joints = positions if turn is None else positions @ turn.T
+    fps, name = archive.frame_rate(), archive.word("name", archive.path.stem)
+    with errors_in(archive.path):
+        return JointTrack(joints, skeleton, fps, name)
+
+
+def write_npz(motion: Motion, path: str | Path, others: Mapping[str, Any] | None = None) -> None:
+    """Write a motion to an ``.npz`` archive, losslessly and atomically.
+
+    ``others`` are further arrays by key, which :func:`read_npz` ignores.
+    """
     skeleton = motion.skeleton
     arrays: dict[str, Any] = {
         "positions": motion.positions,
@@ -93,6 +120,7 @@ def write_npz(motion: Motion, path: str | Path) -> None:
         "joint_names": np.array(skeleton.joint_names),
         "parents": np.array(skeleton.parents, dtype=np.int32),
         "up_axis": np.array("y"),
+        **(others or {}),
     }
     if motion.name:
         arrays["name"] = np.array(motion.name)

@@ -10,7 +10,11 @@ from .distances import (
 )
 from .joint_names import canonical_names as canonical_names, mirrored_name as mirrored_name
 from .kinematics import fit_rotations as fit_rotations, forward_kinematics as forward_kinematics
-from .motion import KeypointTrack as KeypointTrack, Motion as Motion
+from .motion import (
+    JointTrack as JointTrack,
+    KeypointTrack as KeypointTrack,
+    Motion as Motion,
+)
 from .occlusion import joints_at_rate as joints_at_rate, joints_on_skeleton as joints_on_skeleton
 from .presets import PRESETS as PRESETS
 from .resampling import resample as resample

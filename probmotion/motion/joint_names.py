@@ -55,6 +55,13 @@ _SIDED: dict[str, tuple[str, ...]] = {
     "smalltoe": ("small_toe",),
     **dict.fromkeys(("frontpaw", "fpaw"), ("front_paw",)),
     **dict.fromkeys(("backpaw", "hindpaw", "bpaw"), ("back_paw",)),
+    # Joint centres of marker sets.
+    "hjc": ("hip",),
+    "kjc": ("knee",),
+    "ajc": ("ankle",),
+    "sjc": ("shoulder",),
+    "ejc": ("elbow",),
+    "wjc": ("wrist",),
 }
 # Canonical names for CMU's ASF files, which name a joint after the bone that ends there.
 _ASF_CENTRAL = {

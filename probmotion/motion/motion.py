@@ -1,4 +1,4 @@
-"""3D motions and 2D keypoint tracks of a skeleton."""
+"""3D motions, 3D joint tracks with gaps and 2D keypoint tracks of a skeleton."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from probmotion.motion.resampling import resample
-from probmotion.motion.retargeting import matching_joints
+from probmotion.motion.retargeting import counterpart, matching_joints
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_count, check_finite, check_positive, check_shape
 
-__all__ = ["KeypointTrack", "Motion"]
-
+__all__ = ["JointTrack", "KeypointTrack", "Motion"]
 
 _MAX_CONFIDENCE = 2  # largest COCO visibility flag
+_LISTED = 12  # maximum number of names in an error
+_FILLED_BY_PRIORS = frozenset(("pelvis", "neck"))  # joints that many marker sets lack
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +145,93 @@ class Motion:
             f"Motion({self.name or 'unnamed'}: {self.frames} frames at {self.fps:g} fps, "
             f"{self.skeleton.n_joints} joints)"
         )
+
+
+@dataclass(frozen=True, eq=False)
+class JointTrack:
+    """Recorded 3D joints over time, with gaps.
+
+    Parameters
+    ----------
+    joints : ndarray, (L, J, 3)
+        Joint positions, metres, in right-handed world axes with Y up; NaN where missing.
+    skeleton : Skeleton
+        Names and parents of the J joints.
+    fps : float
+        Frames per second.
+    name : str
+        Name of the track.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not match, a joint is infinite or partly NaN, or no joint is observed.
+    """
+
+    joints: np.ndarray
+    skeleton: Skeleton
+    fps: float
+    name: str = field(default="")
+
+    def __post_init__(self) -> None:
+        joints = np.asarray(self.joints, dtype=np.float64)
+        check_shape("joints", joints, ("L", self.skeleton.n_joints, 3))
+        if len(joints) == 0:
+            raise ValueError("joints must contain at least one frame, got none")
+        missing = np.isnan(joints).all(axis=-1)
+        invalid = ~np.isfinite(joints).all(axis=-1) & ~missing
+        if invalid.any():
+            frame, joint = np.argwhere(invalid)[0]
+            raise ValueError(
+                f"joints must be finite, or NaN in all coordinates where missing, got "
+                f"{joints[frame, joint]} at frame {frame}, joint {self.skeleton.joint_names[joint]}"
+            )
+        if missing.all():
+            raise ValueError("joints must be observed in at least one frame, got only gaps")
+        check_positive("fps", self.fps)
+        object.__setattr__(self, "joints", joints)
+        object.__setattr__(self, "fps", float(self.fps))
+
+    @property
+    def frames(self) -> int:
+        """Number of frames L."""
+        return len(self.joints)
+
+    @property
+    def seen(self) -> np.ndarray:
+        """Mask of observed joints, (L, J)."""
+        return np.isfinite(self.joints).all(axis=-1)
+
+    def retarget(self, skeleton: Skeleton) -> JointTrack:
+        """Retarget the track to another skeleton by matching joint names.
+
+        A ``pelvis`` or ``neck`` without a counterpart is missing in every frame. The midpoint of
+        the hips is no substitute: it is 11 cm from the pelvis of CMU's recordings.
+
+        Raises
+        ------
+        ValueError
+            If another joint of ``skeleton`` has no counterpart; the message lists all of them.
+        """
+        if self.skeleton == skeleton:
+            return self
+        joints = np.full((self.frames, skeleton.n_joints, 3), np.nan)
+        lacking = []
+        pairs = zip(skeleton.joint_names, skeleton.canonical_names, strict=True)
+        for joint, (name, canonical) in enumerate(pairs):
+            source = counterpart(self.skeleton, name, canonical)
+            if source is not None:
+                joints[:, joint] = self.joints[:, source]
+            elif canonical not in _FILLED_BY_PRIORS:
+                lacking.append(name)
+        if lacking:
+            names = self.skeleton.joint_names
+            more = ", …" if len(names) > _LISTED else ""
+            raise ValueError(
+                f"joints must include {', '.join(lacking)}, got only "
+                f"{', '.join(name[:20] for name in names[:_LISTED])}{more}"
+            )
+        return replace(self, joints=joints, skeleton=skeleton)
 
 
 @dataclass(frozen=True, eq=False)

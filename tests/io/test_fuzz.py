@@ -14,8 +14,9 @@ from hypothesis import given, settings, strategies as st
 
 from probmotion.io.bvh import read_bvh
 from probmotion.io.errors import MotionFileError, MotionFileWarning
-from probmotion.io.files import load, read_keypoints
-from probmotion.motion.motion import KeypointTrack, Motion
+from probmotion.io.files import load, read_joints, read_keypoints
+from probmotion.motion.motion import JointTrack, KeypointTrack, Motion
+from probmotion.motion.presets import PRESETS
 
 BVH = b"""HIERARCHY
 ROOT Hips {
@@ -75,6 +76,19 @@ coords,x,y,likelihood,x,y
 7,1,2,0.5,0,9
 8,nan,,,0,9
 """
+JOINTS = PRESETS["person14"].joint_names
+TRC = "\n".join(
+    "\t".join(map(str, row))
+    for row in (
+        ["PathFileType", 4, "(X/Y/Z)", "walk.trc"],
+        ["DataRate", "NumFrames", "NumMarkers", "Units"],
+        [30, 2, 14, "m"],
+        ["Frame#", "Time", *(cell for name in JOINTS for cell in (name, "", ""))],
+        ["", "", *(f"{axis}{n}" for n in range(1, 15) for axis in "XYZ")],
+        [1, 0, *np.linspace(0.1, 0.9, 42)],
+        [2, 0.033, *np.linspace(0.1, 0.9, 39), "", "", ""],
+    )
+).encode()
 ARCHIVES = []
 for more in ({}, {"keypoints": np.zeros((4, 2, 2)), "confidence": np.ones((4, 2))}):
     file = io.BytesIO()
@@ -132,6 +146,9 @@ def check(content, ending, read, skeleton=ASF):
             return
     if isinstance(result, Motion):
         assert np.isfinite(result.positions).all()
+    elif isinstance(result, JointTrack):
+        assert not np.isinf(result.joints).any()
+        assert result.seen.any()
     else:
         assert result
         assert all(isinstance(track, KeypointTrack) for track in result)
@@ -145,6 +162,8 @@ FORMATS = [
     (ARCHIVES[1:], ".npz", read_tracks),
     (JSONS, ".json", read_tracks),
     ([TABLE], ".csv", read_tracks),
+    ([TRC], ".trc", read_joints),
+    (ARCHIVES, ".npz", partial(read_joints, unit="m")),
 ]
 
 

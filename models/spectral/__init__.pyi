@@ -1,0 +1,3 @@
+from .conditioned_spectra import ConditionedSpectra as ConditionedSpectra
+from .posterior import SpectralPosterior as SpectralPosterior
+from .spectral_mixture import SpectralMixtureMotion as SpectralMixtureMotion

@@ -1,0 +1,233 @@
+"""Conditioning of rotated spectral components on linear Gaussian observations, with gaps.
+
+At each frame and joint the likelihood of a position x is exp(−½ xᵀΛx + ηᵀx). Most entries have the
+same information Λ₀, under which frequencies are independent: the conditional covariance P₀ is a
+3J × 3J matrix K_f for each frequency. The other entries, such as gaps, differ by Δ = Λ − Λ₀, which
+the Woodbury identity takes into account exactly,
+
+    P = P₀ − P₀ S Z Sᵀ P₀,  Z = Δ (I + G Δ)⁻¹,  G = Sᵀ P₀ S,
+
+where S selects these entries. As products of cosines are sums of cosines, P₀ between frames t and
+t' is Q(t − t') + Q(t + t' + 1), where Q is the inverse Fourier transform of K_f.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from probmotion.models.spectral.spectrum import from_frequencies, to_frequencies
+
+__all__ = ["Component", "Components", "Conditional", "Information", "rotation", "turned"]
+
+
+class Component(NamedTuple):
+    """Gaussian component in its canonical frame.
+
+    ``mean`` (L, J, 3), metres; ``directions`` (B, P, P) of each band of frequencies; ``band`` (L,);
+    ``variances`` (L, P).
+    """
+
+    mean: np.ndarray
+    directions: np.ndarray
+    band: np.ndarray
+    variances: np.ndarray
+
+    def draw(self, unit: np.ndarray) -> np.ndarray:
+        """Return deviations from the mean, given standard normals: ``(n, L, P) → (n, L, J, 3)``."""
+        scores = np.sqrt(self.variances) * unit
+        V = self.directions[self.band]
+        coefficients = (V @ scores[..., None])[..., 0]
+        return from_frequencies(coefficients, axis=1).reshape(len(unit), *self.mean.shape)
+
+
+class Components(NamedTuple):
+    """Gaussians with a canonical heading, repeated at the azimuths ``yaws`` (A,).
+
+    ``log_weights``, (C,), are those of a component at one azimuth.
+    """
+
+    gaussians: tuple[Component, ...]
+    log_weights: np.ndarray
+    yaws: np.ndarray
+
+
+class Information(NamedTuple):
+    """Information matrices of all entries: most common one and the exceptions.
+
+    ``all`` (L, J, 3, 3), ``common`` (3, 3), ``frames`` and ``joints`` (H,) of the exceptions,
+    ``excess`` (H, 3, 3): their Λ − Λ₀.
+    """
+
+    all: np.ndarray
+    common: np.ndarray
+    frames: np.ndarray
+    joints: np.ndarray
+    excess: np.ndarray
+
+    @classmethod
+    def of(cls, information: np.ndarray) -> Information:
+        """Split information matrices (L, J, 3, 3)."""
+        distinct, inverse, counts = np.unique(
+            information.reshape(-1, 9), axis=0, return_inverse=True, return_counts=True
+        )
+        common = distinct[counts.argmax()].reshape(3, 3)
+        other = inverse.reshape(information.shape[:2]) != counts.argmax()
+        frames, joints = np.nonzero(other)
+        return cls(information, common, frames, joints, information[frames, joints] - common)
+
+    @property
+    def isotropic(self) -> bool:
+        """Whether all matrices are multiples of the identity."""
+        diagonal = self.all[..., 0, 0]
+        return bool((self.all == diagonal[..., None, None] * np.eye(3)).all())
+
+    def rotated(self, rotation: np.ndarray) -> Information:
+        """Return the information of Rᵀ x, given that of x."""
+        parts = (rotation.T @ part @ rotation for part in (self.all, self.common, self.excess))
+        everything, common, excess = parts
+        return Information(everything, common, self.frames, self.joints, excess)
+
+
+class Conditional:
+    """Covariance P = (C⁻¹ + Λ)⁻¹ of one component given the information Λ, in canonical frame."""
+
+    def __init__(self, component: Component, information: Information) -> None:
+        self._component = component
+        self.information = information
+        self._kernel, self._log_det = _common_conditional(component, information.common)
+        frames, joints, excess = information.frames, information.joints, information.excess
+        H = len(frames)
+        if H:
+            used, position = np.unique(joints, return_inverse=True)
+            G = self._between(used, (frames, position), (frames, position))
+            # G Δ, block by block.
+            blocks = G.reshape(3 * H, H, 3, 1)
+            parts = (blocks[:, :, i] * excess[:, i] for i in range(3))
+            matrix = sum(parts, np.zeros(())).reshape(3 * H, 3 * H)
+            matrix[np.diag_indices(3 * H)] += 1.0
+            self._factors = scipy.linalg.lu_factor(matrix, check_finite=False)
+            self._log_det += float(np.log(np.abs(np.diag(self._factors[0]))).sum())
+
+    @property
+    def log_determinant(self) -> float:
+        """Log determinant of I + C Λ."""
+        return self._log_det
+
+    def solve(self, shift: np.ndarray) -> np.ndarray:
+        """Return P η: ``(n, L, J, 3) → (n, L, J, 3)``."""
+        out = self._common(shift)
+        if len(self.information.frames):
+            seen = out[:, self.information.frames, self.information.joints]
+            # Z v = Δ (I + G Δ)⁻¹ v.
+            inner = scipy.linalg.lu_solve(
+                self._factors, seen.reshape(len(out), -1).T, check_finite=False
+            ).T.reshape(seen.shape)
+            field = np.zeros_like(out)
+            field[:, self.information.frames, self.information.joints] = np.einsum(
+                "hij,nhj->nhi", self.information.excess, inner
+            )
+            out -= self._common(field)
+        return out
+
+    def draw(self, prior: np.ndarray, unit: np.ndarray) -> np.ndarray:
+        """Return draws of N(0, P), by Matheron's rule.
+
+        Parameters
+        ----------
+        prior, unit : ndarray, (n, L, J, 3)
+            Draws of N(0, C), and independent standard normals.
+        """
+        information = self.information.all
+        size, axes = np.linalg.eigh(information)
+        root = axes * np.sqrt(np.maximum(size, 0.0))[..., None, :]
+        noise = np.einsum("ljab,nljb->nlja", root, unit)
+        return prior + self.solve(noise - np.einsum("ljab,nljb->nlja", information, prior))
+
+    @cached_property
+    def marginals(self) -> np.ndarray:
+        """Covariance matrices of all entries, (L, J, 3, 3)."""
+        L, J, _ = self._component.mean.shape
+        joints = np.arange(J)
+        blocks = self._kernel.reshape(L, J, 3, J, 3)[:, joints, :, joints].swapaxes(0, 1)
+        transform = _lags(blocks)
+        # Q(2t + 1) for t < L, with period 2 L.
+        out = transform[0] + transform[2 * np.arange(L) + 1]
+        frames, joints, excess = (
+            self.information.frames,
+            self.information.joints,
+            self.information.excess,
+        )
+        if len(frames):
+            every = np.divmod(np.arange(L * J), J)
+            cross = self._between(np.arange(J), every, (frames, joints))  # (3 L J, 3 H)
+            inner = scipy.linalg.lu_solve(self._factors, cross.T, check_finite=False)
+            inner = np.einsum("hij,hjx->hix", excess, inner.reshape(len(excess), 3, -1))
+            left = cross.reshape(L * J, 3, -1)
+            right = inner.reshape(-1, L * J, 3).swapaxes(0, 1)
+            out = out - (left @ right).reshape(out.shape)
+        return out
+
+    def _common(self, shift: np.ndarray) -> np.ndarray:
+        """Return P₀ η."""
+        n, L = shift.shape[:2]
+        spectrum = to_frequencies(shift.reshape(n, L, -1), axis=1)
+        product = np.matmul(spectrum.swapaxes(0, 1), self._kernel).swapaxes(0, 1)
+        return from_frequencies(product, axis=1).reshape(shift.shape)
+
+    def _between(
+        self,
+        used: np.ndarray,
+        rows: tuple[np.ndarray, np.ndarray],
+        columns: tuple[np.ndarray, np.ndarray],
+    ) -> np.ndarray:
+        """Return P₀ between entries, given by their frames and indices into the joints ``used``."""
+        L, P, _ = self._kernel.shape
+        kernel = self._kernel.reshape(L, P // 3, 3, P // 3, 3)[:, used][:, :, :, used]
+        transform = np.ascontiguousarray(_lags(kernel).swapaxes(2, 3))  # (2 L, j, j', 3, 3)
+        (t, i), (u, j) = rows, columns
+        out = transform[np.abs(t[:, None] - u), i[:, None], j]
+        out += transform[(t[:, None] + u + 1) % len(transform), i[:, None], j]
+        return out.swapaxes(1, 2).reshape(3 * len(t), 3 * len(u))
+
+
+def turned(field: np.ndarray, azimuth: float) -> np.ndarray:
+    """Return vectors rotated about the vertical by an azimuth: ``(…, 3) → (…, 3)``."""
+    return field @ rotation(azimuth).T
+
+
+def rotation(azimuth: float) -> np.ndarray:
+    """Return the rotation matrix of an azimuth about the vertical, (3, 3)."""
+    c, s = math.cos(azimuth), math.sin(azimuth)
+    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+
+def _common_conditional(component: Component, information: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return K_f, (L, P, P), and log det(I + C Λ₀), for the same Λ₀ at all entries."""
+    V, variances = component.directions[component.band], component.variances
+    transposed = V.swapaxes(1, 2)
+    size, axes = np.linalg.eigh(information)
+    if np.ptp(size) <= 1e-12 * abs(size[-1]):
+        ratio = 1 + size.mean() * variances
+        return (V * (variances / ratio)[:, None, :]) @ transposed, float(np.log(ratio).sum())
+    keep = size > 1e-12 * size[-1]
+    roots = (axes[:, keep] * np.sqrt(size[keep])).T  # (m, 3)
+    L, P, _ = V.shape
+    seen = np.einsum("mi,ljip->ljmp", roots, V.reshape(L, P // 3, 3, P)).reshape(L, -1, P)
+    projected = variances[:, None, :] * seen  # (L, m J, P)
+    matrix = projected @ seen.swapaxes(1, 2)
+    matrix[:, np.arange(seen.shape[1]), np.arange(seen.shape[1])] += 1.0
+    lower = np.linalg.cholesky(matrix)
+    half = np.linalg.solve(lower, projected @ transposed)
+    kernel = (V * variances[:, None, :]) @ transposed - half.swapaxes(1, 2) @ half
+    diagonal = np.diagonal(lower, axis1=1, axis2=2)
+    return kernel, 2 * float(np.log(diagonal).sum())
+
+
+def _lags(kernel: np.ndarray) -> np.ndarray:
+    """Return Q(τ) = Σ_f s_f² K_f cos(π f τ / L) / 2 for τ < 2 L, s_0² = 1/L, s_f² = 2/L."""
+    return np.fft.irfft(np.concatenate([kernel, np.zeros_like(kernel[:1])]), axis=0)

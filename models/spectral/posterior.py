@@ -1,0 +1,284 @@
+"""Exact posterior of a spectral mixture under a linear Gaussian likelihood."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import cached_property
+
+import numpy as np
+
+from probmotion.arrays import Array, logsumexp
+from probmotion.models.mixture.posterior import natural_parameters
+from probmotion.models.mixture.rotated_mixture import rotation_coefficients, rotation_fields
+from probmotion.models.spectral.conditioning import (
+    Component,
+    Components,
+    Conditional,
+    Information,
+    rotation,
+    turned,
+)
+from probmotion.posteriors.protocols import Likelihood
+
+__all__ = ["SpectralPosterior", "condition", "draw"]
+
+_NEGLIGIBLE = 1e-9  # probability of components without effect on moments
+
+
+def condition(
+    components: Components, information: np.ndarray, shift: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Condition a mixture on exp(−½ xᵀΛx + ηᵀx) at every entry, for n values of η.
+
+    Parameters
+    ----------
+    components : Components
+        Mixture p(X).
+    information : ndarray, (L, J, 3, 3)
+        Λ.
+    shift : ndarray, (n, L, J, 3)
+        η.
+
+    Returns
+    -------
+    log_joint : ndarray, (n, C, A)
+        Log of each component's probability times its integral of the likelihood.
+    mean : ndarray, (n, L, J, 3)
+        Posterior mean of the mixture, metres.
+    """
+    split = Information.of(information)
+    log_joint = np.empty((len(shift), len(components.gaussians), len(components.yaws)))
+    mean = np.zeros(shift.shape)
+    top = np.full(len(shift), -np.inf)
+    total = np.zeros(len(shift))
+    for c, azimuths, log_terms, means in _conditioned(components, split, shift):
+        log_joint[:, c, azimuths] = log_terms
+        # Accumulate Σ p E[X] relative to the largest term so far.
+        raised = np.maximum(top, log_terms.max(axis=1))
+        old = np.exp(top - raised)
+        weights = np.exp(log_terms - raised[:, None])
+        total = total * old + weights.sum(axis=1)
+        mean *= old[:, None, None, None]
+        mean += means(weights)
+        top = raised
+    return log_joint, mean / total[:, None, None, None]
+
+
+def draw(
+    components: Components,
+    information: np.ndarray,
+    shift: np.ndarray,
+    log_joint: np.ndarray,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Return one draw of the posterior for each of n values of η, (n, L, J, 3), metres.
+
+    Arguments are those of :func:`condition` and ``log_joint``, (n, C, A), its result.
+    """
+    split = Information.of(information)
+    n, A = len(shift), len(components.yaws)
+    flat = log_joint.reshape(n, -1)
+    cumulative = np.cumsum(np.exp(flat - flat.max(axis=1, keepdims=True)), axis=1)
+    chosen = (cumulative < rng.random((n, 1)) * cumulative[:, -1:]).sum(axis=1)
+    scores = rng.standard_normal((n, shift.shape[1], 3 * shift.shape[2]))
+    unit = rng.standard_normal(shift.shape)
+    out = np.empty(shift.shape)
+    conditionals: dict[int, Conditional] = {}
+    for index in np.unique(chosen).tolist():
+        c, a = divmod(index, A)
+        rows = np.flatnonzero(chosen == index)
+        component, R = components.gaussians[c], rotation(components.yaws[a])
+        local = split if split.isotropic else split.rotated(R)
+        if not split.isotropic or c not in conditionals:
+            conditionals = {c: Conditional(component, local)}
+        conditional = conditionals[c]
+        pull = np.einsum("ljab,ljb->lja", local.all, component.mean)
+        centre = component.mean + conditional.solve(shift[rows] @ R - pull)
+        out[rows] = (centre + conditional.draw(component.draw(scores[rows]), unit[rows])) @ R.T
+    return out
+
+
+def _conditioned(
+    components: Components, information: Information, shift: np.ndarray
+) -> Iterator[tuple]:
+    """Yield per component: index, azimuths, their log terms (n, a), and the weighted mean's sum."""
+    if information.isotropic:
+        # P does not depend on the azimuth: three base fields of η give all azimuths.
+        fields = rotation_fields(shift.reshape(len(shift), -1, 3)).swapaxes(0, 1)
+        fields = fields.reshape(3, *shift.shape)
+        to_canonical = rotation_coefficients(-components.yaws)
+        for c, component in enumerate(components.gaussians):
+            conditional = Conditional(component, information)
+            terms, solved = _solve(component, conditional, information, fields, to_canonical)
+            log_terms = terms + components.log_weights[c]
+
+            def means(
+                weights: np.ndarray, component: Component = component, solved: np.ndarray = solved
+            ) -> np.ndarray:
+                turns = rotation_coefficients(components.yaws)
+                sums = np.einsum("na,ai,aj->nij", weights, turns, to_canonical)
+                solved[2] += component.mean
+                base = np.einsum("nij,jnltx->inltx", sums, solved, optimize=True)
+                rotated = rotation_fields(base.reshape(3, len(weights), -1, 3))
+                return sum(rotated[i, :, i] for i in range(3)).reshape(solved.shape[1:])
+
+            yield c, slice(None), log_terms, means
+        return
+    for a, yaw in enumerate(components.yaws):
+        local = information.rotated(rotation(yaw))
+        fields = turned(shift, -yaw)[None]
+        for c, component in enumerate(components.gaussians):
+            conditional = Conditional(component, local)
+            terms, solved = _solve(component, conditional, local, fields, np.ones((1, 1)))
+            clean = turned(solved[0] + component.mean, yaw)
+            yield (
+                c,
+                slice(a, a + 1),
+                terms + components.log_weights[c],
+                lambda weights, clean=clean: weights[:, :, None, None] * clean,
+            )
+
+
+def _solve(
+    component: Component,
+    conditional: Conditional,
+    information: Information,
+    fields: np.ndarray,
+    coefficients: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return log integrals for η = Σ_i c_i η_i and the conditional means of the fields.
+
+    Parameters
+    ----------
+    fields : ndarray, (i, n, L, J, 3)
+        η_i in the canonical frame.
+    coefficients : ndarray, (a, i)
+        c; the last coefficient is 1.
+
+    Returns
+    -------
+    log_terms : ndarray, (n, a)
+        log ∫ N(x; m, C) exp(−½ xᵀΛx + ηᵀx) dx.
+    solved : ndarray, (i, n, L, J, 3)
+        P η_i, the last with η − Λ m, so that Σ c_i P η_i = E[x] − m.
+    """
+    i, n = fields.shape[:2]
+    pull = np.einsum("ljab,ljb->lja", information.all, component.mean)
+    linear = np.einsum("inljx,ljx->ni", fields, component.mean, optimize=True)
+    shifted = fields.copy()
+    shifted[-1] -= pull
+    solved = conditional.solve(shifted.reshape(i * n, *fields.shape[2:])).reshape(fields.shape)
+    gram = np.einsum("inljx,knljx->nik", shifted, solved, optimize=True)
+    square = np.einsum("ai,nik,ak->na", coefficients, gram, coefficients, optimize=True)
+    constant = -0.5 * float((component.mean * pull).sum()) - 0.5 * conditional.log_determinant
+    return linear @ coefficients.T + 0.5 * square + constant, solved
+
+
+class SpectralPosterior:
+    """Posterior p(X | y) of a spectral mixture; the prior if there is no likelihood.
+
+    Created by :meth:`SpectralMixtureMotion.exact_posterior` from the prior's components, its log
+    density and mean (L, J, 3), and a likelihood with ``linear()``; raises ``NotConjugate`` for
+    other likelihoods.
+    """
+
+    def __init__(
+        self,
+        components: Components,
+        log_prior: Callable[[Array], Array],
+        prior_mean: np.ndarray,
+        likelihood: Likelihood | None,
+    ) -> None:
+        self.components = components
+        self.likelihood = likelihood
+        self._log_prior = log_prior
+        self._prior_mean = prior_mean
+        L, J, _ = prior_mean.shape
+        information, shift, self._constant = natural_parameters(likelihood, L * J)
+        self.information = information.reshape(L, J, 3, 3)
+        self.shift = shift.reshape(L, J, 3)
+
+    @cached_property
+    def _conditioned(self) -> tuple[np.ndarray, np.ndarray]:
+        """Log joint density log p(y, c, a), (C, A), and E[X | y], (L, J, 3)."""
+        if self.likelihood is None:
+            parts = self.components
+            return np.repeat(parts.log_weights[:, None], len(parts.yaws), axis=1), self._prior_mean
+        log_joint, mean = condition(self.components, self.information, self.shift[None])
+        return log_joint[0] + self._constant, mean[0]
+
+    @property
+    def log_marginal_likelihood(self) -> float:
+        """Log marginal likelihood log p(y)."""
+        return float(logsumexp(self._conditioned[0].reshape(-1)))
+
+    @property
+    def component_probabilities(self) -> np.ndarray:
+        """Probabilities p(component c, azimuth a | y), (C, A)."""
+        return np.exp(self._conditioned[0] - self.log_marginal_likelihood)
+
+    def mean(self) -> np.ndarray:
+        """Return E[X | y], (L, J, 3), metres."""
+        return self._conditioned[1].copy()
+
+    def covariances(self) -> np.ndarray:
+        """Return the covariance matrix of each entry given y, (L, J, 3, 3), square metres."""
+        mean = self.mean()
+        total = np.zeros((*mean.shape, 3))
+        for weight, c, a in self._active():
+            component, conditional, local_shift, R = self._conditional(c, a)
+            centre = component.mean + self._deviation(component, conditional, local_shift)
+            difference = centre @ R.T - mean
+            total += weight * (
+                R @ conditional.marginals @ R.T
+                + difference[..., :, None] * difference[..., None, :]
+            )
+        return total
+
+    def sample(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """Return n independent draws, (n, L, J, 3), metres."""
+        log_joint = np.broadcast_to(self._conditioned[0], (n, *self._conditioned[0].shape))
+        shift = np.broadcast_to(self.shift, (n, *self.shift.shape))
+        return draw(self.components, self.information, shift, log_joint, rng)
+
+    def log_density(self, positions: Array) -> Array:
+        """Return log p(X | y), normalised: ``(…, L, J, 3) → (…)``; NumPy, torch or JAX."""
+        value = self._log_prior(positions)
+        if self.likelihood is None:
+            return value
+        evidence = self.log_marginal_likelihood
+        return value + self.likelihood.log_density(positions) - evidence
+
+    def _active(self) -> Iterator[tuple[float, int, int]]:
+        """Yield probability, component and azimuth of all that contribute to moments."""
+        probabilities = self.component_probabilities
+        for c, a in zip(*np.nonzero(probabilities > _NEGLIGIBLE), strict=True):
+            yield float(probabilities[c, a]), int(c), int(a)
+
+    def _conditional(self, c: int, a: int) -> tuple[Component, Conditional, np.ndarray, np.ndarray]:
+        """Return a component, its conditional, η in its frame, and its rotation matrix."""
+        component = self.components.gaussians[c]
+        R = rotation(self.components.yaws[a])
+        information = self._information
+        if not information.isotropic:
+            information = information.rotated(R)
+        key = c if self._information.isotropic else (c, a)
+        if key not in self._conditionals:
+            self._conditionals[key] = Conditional(component, information)
+        return component, self._conditionals[key], self.shift @ R, R
+
+    @cached_property
+    def _information(self) -> Information:
+        return Information.of(self.information)
+
+    @cached_property
+    def _conditionals(self) -> dict:
+        return {}
+
+    def _deviation(
+        self, component: Component, conditional: Conditional, shift: np.ndarray
+    ) -> np.ndarray:
+        """Return E[X | y, c, a] − m in the component's frame, (L, J, 3)."""
+        information = conditional.information.all
+        pull = np.einsum("ljab,ljb->lja", information, component.mean)
+        return conditional.solve((shift - pull)[None])[0]

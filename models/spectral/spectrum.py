@@ -1,0 +1,57 @@
+"""Discrete cosine transform over frames, and spectra at other numbers of frames and frame rates.
+
+The orthonormal DCT-II of L frames has the frequencies ν_f = f · fps / (2 L), f < L.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.fft import dct, idct
+
+__all__ = ["bands", "from_frequencies", "ramp", "resampled", "to_frequencies"]
+
+
+def to_frequencies(values: np.ndarray, axis: int) -> np.ndarray:
+    """Return the orthonormal DCT-II along an axis of frames."""
+    return dct(values, axis=axis, norm="ortho")
+
+
+def from_frequencies(values: np.ndarray, axis: int) -> np.ndarray:
+    """Return the inverse of :func:`to_frequencies`."""
+    return idct(values, axis=axis, norm="ortho")
+
+
+def ramp(frames: int, fps: float) -> np.ndarray:
+    """Return the coefficients of a motion at unit velocity, centred in time, (L,), seconds."""
+    times = (np.arange(frames) - (frames - 1) / 2) / fps
+    return to_frequencies(times, axis=0)
+
+
+def bands(frames: int) -> np.ndarray:
+    """Return the band of each frequency, (L,): frequency 0, then octaves from frequency 1 on.
+
+    The octaves are 1, 2, 3–4, 5–8, …: their upper edges are powers of two.
+    """
+    frequencies = np.arange(1, frames)
+    return np.concatenate([[0], np.ceil(np.log2(frequencies)).astype(int) + 1])
+
+
+def resampled(
+    variances: np.ndarray, band: np.ndarray, fps: float, frames: int, new_fps: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return variances (K, L', P) and bands (L',) for other numbers of frames and frame rates.
+
+    The variance of a coefficient is proportional to the spectral density times the frame rate. The
+    density is that of the nearest old frequency, since neighbouring bands have different
+    directions. Above the old range, it falls with the fourth power of the frequency, as that of
+    white acceleration. The variance of the mean over frames is unchanged.
+    """
+    old = np.arange(variances.shape[1]) * fps / (2 * variances.shape[1])
+    new = np.arange(frames) * new_fps / (2 * frames)
+    nearest = np.abs(new[:, None] - old[None, 1:]).argmin(axis=1) + 1 if len(old) > 1 else 0 * new
+    nearest = np.where(np.arange(frames) == 0, 0, nearest).astype(int)
+    factor = np.full(frames, new_fps / fps)
+    above = new > old[-1]
+    factor[above] *= (old[-1] / new[above]) ** 4 if old[-1] > 0 else 1.0
+    factor[0] = frames / variances.shape[1]
+    return variances[:, nearest] * factor[:, None], band[nearest]

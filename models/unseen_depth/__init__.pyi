@@ -1,0 +1,3 @@
+from .annotation_prior import AnnotationPrior as AnnotationPrior
+from .keypoints import AnnotationLifts as AnnotationLifts
+from .track_prior import motion_prior_from_tracks as motion_prior_from_tracks
