@@ -55,6 +55,11 @@ class Components(NamedTuple):
     log_weights: np.ndarray
     yaws: np.ndarray
 
+    def subset(self, chosen: np.ndarray) -> Components:
+        """Return some components, with unchanged weights."""
+        gaussians = tuple(self.gaussians[c] for c in chosen)
+        return Components(gaussians, self.log_weights[chosen], self.yaws)
+
 
 class Information(NamedTuple):
     """Information matrices of all entries: most common one and the exceptions.
@@ -210,22 +215,20 @@ def _common_conditional(component: Component, information: np.ndarray) -> tuple[
     """Return K_f, (L, P, P), and log det(I + C Λ₀), for the same Λ₀ at all entries."""
     V, variances = component.directions[component.band], component.variances
     transposed = V.swapaxes(1, 2)
-    size, axes = np.linalg.eigh(information)
-    if np.ptp(size) <= 1e-12 * abs(size[-1]):
-        ratio = 1 + size.mean() * variances
+    if (information == information[0, 0] * np.eye(3)).all():
+        ratio = 1 + information[0, 0] * variances
         return (V * (variances / ratio)[:, None, :]) @ transposed, float(np.log(ratio).sum())
-    keep = size > 1e-12 * size[-1]
-    roots = (axes[:, keep] * np.sqrt(size[keep])).T  # (m, 3)
+    # K = (I/λ + VᵀΛV)⁻¹ in the directions, as the square of a triangular root, since a difference
+    # of covariances would lose digits where the noise is small.
     L, P, _ = V.shape
-    seen = np.einsum("mi,ljip->ljmp", roots, V.reshape(L, P // 3, 3, P)).reshape(L, -1, P)
-    projected = variances[:, None, :] * seen  # (L, m J, P)
-    matrix = projected @ seen.swapaxes(1, 2)
-    matrix[:, np.arange(seen.shape[1]), np.arange(seen.shape[1])] += 1.0
+    scaled = V * np.sqrt(variances)[:, None, :]
+    weighted = (information @ scaled.reshape(L, P // 3, 3, P)).reshape(L, P, P)
+    matrix = scaled.swapaxes(1, 2) @ weighted
+    matrix[:, np.arange(P), np.arange(P)] += 1.0
     lower = np.linalg.cholesky(matrix)
-    half = np.linalg.solve(lower, projected @ transposed)
-    kernel = (V * variances[:, None, :]) @ transposed - half.swapaxes(1, 2) @ half
+    half = np.linalg.solve(lower, scaled.swapaxes(1, 2))
     diagonal = np.diagonal(lower, axis1=1, axis2=2)
-    return kernel, 2 * float(np.log(diagonal).sum())
+    return half.swapaxes(1, 2) @ half, 2 * float(np.log(diagonal).sum())
 
 
 def _lags(kernel: np.ndarray) -> np.ndarray:

@@ -21,10 +21,13 @@ from probmotion.validation import check_count
 
 __all__ = ["fit_components"]
 
-_NUMBERS = (1, 4, 8, 12, 16, 24)  # of components to choose from
+_NUMBERS = (1, 4, 8, 16, 24, 32)  # of components to choose from
 _SHRINKAGES = (5.0, 20.0, 80.0)  # windows' worth of the moments of all windows
 _FOLDS = 3
 _GLOBAL_WEIGHT = 0.05  # of the component of all windows
+_INDEPENDENT = (0.1, 0.02)
+"""Weight of independent coordinates in covariances, at frequency 0 and at others: correlations of
+postures are estimated from few clips, and are too large for motion that is unlike them."""
 _FLOOR = 1e-8  # smallest variance of a coefficient, square metres
 _LOW = 3  # frequencies that describe a window for clustering
 SCALES = np.array([0.25, 1.0, 4.0])
@@ -136,8 +139,10 @@ def _translations(J: int) -> np.ndarray:
 
 
 def _component(moments: Moments) -> dict[str, np.ndarray]:
-    """Return the parameters of one component."""
+    """Return the parameters of one component, with correlations reduced by ``_INDEPENDENT``."""
     L, P, _ = moments.bands.shape
+    share = np.where(np.arange(L) == 0, *_INDEPENDENT)[:, None, None]
+    covariances = moments.bands * (1 - share + share * np.eye(P))
     band = bands(L)
     directions = np.empty((band[-1] + 1, P, P))
     variances = np.empty((L, P))
@@ -145,10 +150,10 @@ def _component(moments: Moments) -> dict[str, np.ndarray]:
     # At frequency 0 the translations come first; the others are principal directions of their
     # complement.
     complement = np.linalg.qr(along, mode="complete")[0][:, 2:]
-    _, axes = np.linalg.eigh(complement.T @ moments.bands[0] @ complement)
+    _, axes = np.linalg.eigh(complement.T @ covariances[0] @ complement)
     directions[0] = np.concatenate([along, complement @ axes[:, ::-1]], axis=1)
     for index in range(band[-1] + 1):
-        own = moments.bands[band == index]
+        own = covariances[band == index]
         if index > 0:
             directions[index] = np.linalg.eigh(own.mean(axis=0))[1][:, ::-1]
         V = directions[index]
@@ -228,7 +233,10 @@ def _chosen(
     held_out = [np.isin(clip_of, part) for part in np.array_split(clips, _FOLDS) if len(part)]
     if len(held_out) < 2:
         # One clip: hold out consecutive windows.
-        held_out = [np.arange(len(clip_of)) * _FOLDS // len(clip_of) == i for i in range(_FOLDS)]
+        parts = np.arange(len(clip_of)) * _FOLDS // len(clip_of)
+        held_out = [parts == part for part in np.unique(parts)]
+    if len(held_out) < 2:
+        return 1, _SHRINKAGES[1]
     fewest = min(int((~mask).sum()) for mask in held_out)
     numbers = [number for number in _NUMBERS if 3 * number <= fewest] or [1]
 

@@ -194,6 +194,10 @@ class SpectralPosterior:
         self._log_prior = log_prior
         self._prior_mean = prior_mean
         L, J, _ = prior_mean.shape
+        seen = getattr(likelihood, "entries", None)
+        if seen is not None and seen.confidence.shape[-2:] != (L, J):
+            got = "{} frames of {} joints".format(*seen.confidence.shape[-2:])
+            raise ValueError(f"likelihood must have {L} frames of {J} joints, got {got}")
         information, shift, self._constant = natural_parameters(likelihood, L * J)
         self.information = information.reshape(L, J, 3, 3)
         self.shift = shift.reshape(L, J, 3)

@@ -138,27 +138,24 @@ class RotatedSpectra:
         """Return log p(X): ``(n, L, J, 3) → (n,)``; NumPy, torch or JAX."""
         xp = array_namespace(x)
         precision = 1 / self._spectra
-        K = self.shape[0]
+        K, n = self.shape[0], x.shape[0]
         ground = xp.concat([x[..., 0], x[..., 2]], axis=-1)
         turned = xp.concat([x[..., 2], -x[..., 0]], axis=-1)
-        logits = []
-        for k in range(K):
-            products = []
-            for b, rows in self._bands:
-                V, H = constant(self._ground[k, b], x), constant(self._height[k, b], x)
-                parts = (ground[:, rows] @ V, turned[:, rows] @ V, x[:, rows, :, 1] @ H)
-                products.append(parts)
-            bases = [
-                xp.reshape(xp.concat(parts, axis=1), (x.shape[0], -1))
-                for parts in zip(*products, strict=True)
-            ]
-            bases[2] = bases[2] - constant(self._means[k], x)
-            weight = constant(precision[k].T, x)
-            gram = xp.stack([(bases[i] * bases[j]) @ weight for i, j in _PAIRS], axis=-1)
-            squares = gram @ constant(self._squares, x)  # (n, S, A)
-            offset = self._log_weights[k] + 0.5 * np.log(precision[k]).sum(axis=-1)
-            logits.append(constant(offset, x)[:, None] - 0.5 * squares)
-        values = logsumexp(xp.reshape(xp.stack(logits, axis=1), (x.shape[0], -1)))
+        products = []
+        for b, rows in self._bands:
+            V, H = constant(self._ground[:, None, b], x), constant(self._height[:, None, b], x)
+            products.append((ground[:, rows] @ V, turned[:, rows] @ V, x[:, rows, :, 1] @ H))
+        bases = [
+            xp.reshape(xp.concat(parts, axis=2), (K, n, -1))
+            for parts in zip(*products, strict=True)
+        ]
+        bases[2] = bases[2] - constant(self._means[:, None], x)
+        weight = constant(np.swapaxes(precision, 1, 2), x)
+        gram = xp.stack([(bases[i] * bases[j]) @ weight for i, j in _PAIRS], axis=-1)
+        squares = gram @ constant(self._squares, x)  # (K, n, S, A)
+        offset = self._log_weights + 0.5 * np.log(precision).sum(axis=-1)
+        logits = constant(offset, x)[:, None, :, None] - 0.5 * squares
+        values = logsumexp(xp.reshape(xp.permute_dims(logits, (1, 0, 2, 3)), (n, -1)))
         return values - 0.5 * self._means.shape[1] * math.log(2 * math.pi)
 
     def _bases(self, y: np.ndarray, k: int, *, shifted: bool) -> np.ndarray:
@@ -179,18 +176,34 @@ class RotatedSpectra:
             out[2] -= self._means[k]
         return out
 
-    def _responsibilities(
+    def log_evidence(self, y: np.ndarray, variance: float) -> np.ndarray:
+        """Return log p(k, s, a, y) up to a constant: ``(n, L, J, 3) → (n, K, S, A)``."""
+        out = np.empty((len(y), *self.shape))
+        precision = 1 / (self._spectra + variance)
+        log_det = np.log(precision).sum(axis=-1)
+        for rows, block in blocks(y):
+            bases = [self._bases(block, k, shifted=True) for k in range(self.shape[0])]
+            out[rows] = self._logits(bases, precision, log_det)[: rows.stop - rows.start]
+        return out
+
+    def _logits(
         self, bases: list[np.ndarray], precision: np.ndarray, log_det: np.ndarray
     ) -> np.ndarray:
-        """Return p(k, s, a | y), (n, K, S, A); ``log_det`` is that of the precision, (K, S)."""
+        """Return log p(k, s, a, y), (n, K, S, A); ``log_det`` is that of the precision, (K, S)."""
         K, S, A = self.shape
-        n = bases[0].shape[1]
-        logits = np.empty((n, K, S, A))
+        logits = np.empty((bases[0].shape[1], K, S, A))
         for k in range(K):
             gram = np.stack([(bases[k][i] * bases[k][j]) @ precision[k].T for i, j in _PAIRS], -1)
             logits[:, k] = gram @ self._squares  # (n, S, 6) @ (6, A)
         logits *= -0.5
         logits += (self._log_weights + 0.5 * log_det)[..., None]
+        return logits
+
+    def _responsibilities(
+        self, bases: list[np.ndarray], precision: np.ndarray, log_det: np.ndarray
+    ) -> np.ndarray:
+        """Return p(k, s, a | y), (n, K, S, A)."""
+        logits = self._logits(bases, precision, log_det)
         logits -= logits.max(axis=(1, 2, 3), keepdims=True)
         weights = np.exp(logits)
         weights /= weights.sum(axis=(1, 2, 3), keepdims=True)

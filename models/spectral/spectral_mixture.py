@@ -123,6 +123,13 @@ class SpectralMixtureMotion:
         check_shape("scale_weights", self.scale_weights, self.scales.shape)
         for name in ("poses", "velocities", "directions"):
             check_finite(name, getattr(self, name))
+        steps = np.diff(self.band, prepend=0)
+        if self.band[0] != 0 or steps.min() < 0 or self.band[-1] >= self.directions.shape[1]:
+            bands = self.directions.shape[1]
+            raise ValueError(f"band must ascend from 0 to at most {bands - 1}, got {self.band}")
+        gram = self.directions.swapaxes(-1, -2) @ self.directions
+        if abs(gram - np.eye(3 * J)).max() > 1e-6:
+            raise ValueError("directions must have orthonormal columns; orthonormalise them first")
         for name in ("variances", "weights", "scales", "scale_weights"):
             values = getattr(self, name)
             check_finite(name, values)
@@ -374,6 +381,16 @@ class SpectralMixtureMotion:
         check_shape("positions", positions, ("n", *self._means.shape[1:]))
         coefficients = to_frequencies(np.asarray(positions), axis=1)
         return self._spectra_mixture.responsibilities(coefficients).sum(axis=(2, 3))
+
+    def log_evidence(self, positions: np.ndarray, noise: float) -> np.ndarray:
+        """Return log p(component, azimuth, y) for positions y with noise, up to a constant, (C, A).
+
+        ``positions`` (L, J, 3) and the standard deviation ``noise`` are in metres.
+        """
+        check_shape("positions", positions, self._means.shape[1:])
+        coefficients = to_frequencies(positions, axis=0)[None]
+        evidence = self._spectra_mixture.log_evidence(coefficients, noise**2)
+        return evidence.reshape(-1, self.azimuths)
 
     def log_prior(self, positions: Array) -> Array:
         """Return the normalised log density of positions: ``(…, L, J, 3) → (…)``."""

@@ -51,7 +51,7 @@ def resampled(
     nearest = np.abs(new[:, None] - old[None, 1:]).argmin(axis=1) + 1 if len(old) > 1 else 0 * new
     nearest = np.where(np.arange(frames) == 0, 0, nearest).astype(int)
     factor = np.full(frames, new_fps / fps)
-    above = new > old[-1]
-    factor[above] *= (old[-1] / new[above]) ** 4 if old[-1] > 0 else 1.0
+    above = new > fps / 2
+    factor[above] *= (fps / 2 / new[above]) ** 4
     factor[0] = frames / variances.shape[1]
     return variances[:, nearest] * factor[:, None], band[nearest]

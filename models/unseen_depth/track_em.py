@@ -15,14 +15,14 @@ import numpy as np
 
 from probmotion.arrays import logsumexp
 from probmotion.geometry.cameras import Cameras
-from probmotion.models.spectral.conditioning import rotation
+from probmotion.models.spectral.conditioning import Component, rotation
 from probmotion.models.spectral.fit import Moments
 from probmotion.models.spectral.spectral_mixture import SpectralMixtureMotion
 from probmotion.models.spectral.spectrum import from_frequencies, ramp, to_frequencies
 
 __all__ = ["Expectation", "expectation", "maximisation", "moments", "prior_of"]
 
-_LEAST_WEIGHT = 1e-3  # views of less posterior probability than this are left out
+_LEAST_WEIGHT = 1e-3  # less probable views, relative to the most probable one, are left out
 _PSEUDO_WINDOWS = 10  # weight of the white covariance, in windows
 _WHITE = 0.005  # its standard deviation, metres
 _FLOOR = 1e-8  # smallest variance of a coefficient, square metres
@@ -33,9 +33,10 @@ class Expectation(NamedTuple):
 
     ``counts`` (K,), ``sums`` (K, L, P) and ``squares`` (K, L, P, P) are the expected number of
     windows, and sums and second moments of deviations from ``means`` (K, L, P). ``coefficients``
-    (n, L, P) and ``images`` (n, L, J, 2) are posterior means of the motions in their canonical
-    heading, and of their images. ``azimuth_concentration`` is 1 if all views share one horizontal
-    axis, and 0 if azimuths are uniform. ``log_density`` is the mean log density of a window.
+    (n, L, P), ``images`` (n, L, J, 2) and ``depths`` (n, L, J) are posterior means of the motions
+    in their canonical heading, of their images, and of the joints' distances behind the origin.
+    ``azimuth_concentration`` is 1 if all views share one horizontal axis, and 0 if azimuths are
+    uniform. ``log_density`` is the mean log density of a window.
     """
 
     counts: np.ndarray
@@ -44,6 +45,7 @@ class Expectation(NamedTuple):
     means: np.ndarray
     coefficients: np.ndarray
     images: np.ndarray
+    depths: np.ndarray
     azimuth_concentration: float
     log_density: float
 
@@ -58,22 +60,18 @@ def expectation(
     """
     n, L, J, _ = images.shape
     P = 3 * J
-    y = np.ascontiguousarray(to_frequencies(images.reshape(n, L, 2 * J), axis=1).swapaxes(0, 1))
+    y = to_frequencies(images.reshape(n, L, 2 * J), axis=1).transpose(1, 2, 0).copy()  # (L, 2 J, n)
     gaussians = prior.components.gaussians
     K = len(gaussians)
     means = np.stack([to_frequencies(part.mean, axis=0).reshape(L, P) for part in gaussians])
-    covariances = [
-        (V * part.variances[:, None, :]) @ V.swapaxes(1, 2)
-        for part in gaussians
-        for V in (part.directions[part.band],)
+    covariances = [_covariances(part) for part in gaussians]
+    cameras = Cameras.around(np.zeros(len(elevations)), elevations).rotation
+    views = [(azimuth, camera @ rotation(azimuth)) for camera in cameras for azimuth in prior.yaws]
+    cells = [
+        (k, azimuth, np.kron(np.eye(J), axes[:2]), axes[2])
+        for k in range(K)
+        for azimuth, axes in views
     ]
-    cameras = Cameras.around(np.zeros(len(elevations)), elevations).rotation[:, :2]
-    views = [
-        (azimuth, np.kron(np.eye(J), camera @ rotation(azimuth)))
-        for camera in cameras
-        for azimuth in prior.yaws
-    ]
-    cells = [(k, azimuth, A) for k in range(K) for azimuth, A in views]
 
     def image_precision(k: int, A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return A C and the inverse Cholesky factor of A C Aᵀ + σ² I, at all frequencies."""
@@ -82,27 +80,30 @@ def expectation(
         return seen, np.linalg.inv(np.linalg.cholesky(total))
 
     logits = np.empty((len(cells), n))
-    for c, (k, _, A) in enumerate(cells):
+    for c, (k, _, A, _) in enumerate(cells):
         factor = image_precision(k, A)[1]
-        white = (y - (means[k] @ A.T)[:, None]) @ factor.swapaxes(1, 2)
         logdet = np.log(np.diagonal(factor, axis1=1, axis2=2)).sum()
-        weight = prior.components.log_weights[k] - math.log(len(elevations))
-        logits[c] = weight + logdet - np.einsum("lni,lni->n", white, white) / 2
+        logits[c] = prior.components.log_weights[k] - math.log(len(elevations)) + logdet
+        # One frequency at a time, whose images fit into a core's cache.
+        for image, centre, whitening in zip(y, means[k] @ A.T, factor, strict=True):
+            white = whitening @ image - (whitening @ centre)[:, None]
+            logits[c] -= np.einsum("in,in->n", white, white) / 2
     log_density = logsumexp(logits, axis=0)
-    weights = np.exp(logits - log_density)
+    weights = np.exp(logits - logits.max(axis=0))
     weights[weights < _LEAST_WEIGHT] = 0.0
     weights /= weights.sum(axis=0)
 
     counts, sums, squares = np.zeros(K), np.zeros((K, L, P)), np.zeros((K, L, P, P))
     coefficients, seen_images = np.zeros((L, n, P)), np.zeros((L, n, 2 * J))
-    axes = np.zeros(n, dtype=complex)  # means of the azimuths' directions, opposite ones alike
-    for weight, (k, azimuth, A) in zip(weights, cells, strict=True):
+    depths = np.zeros((L, n, J))
+    directions = np.zeros(n, dtype=complex)  # means of azimuths, opposite ones alike
+    for weight, (k, azimuth, A, away) in zip(weights, cells, strict=True):
         rows = np.flatnonzero(weight)
         if not len(rows):
             continue
         seen, factor = image_precision(k, A)
         gain = factor.swapaxes(1, 2) @ (factor @ seen)
-        deviation = (y[:, rows] - (means[k] @ A.T)[:, None]) @ gain
+        deviation = (y[:, :, rows].swapaxes(1, 2) - (means[k] @ A.T)[:, None]) @ gain
         weighted = weight[rows, None] * deviation
         counts[k] += weight.sum()
         sums[k] += weighted.sum(axis=1)
@@ -111,7 +112,8 @@ def expectation(
         mean = weighted + weight[rows, None] * means[k][:, None]
         coefficients[:, rows] += mean
         seen_images[:, rows] += mean @ A.T
-        axes[rows] += weight[rows] * np.exp(2j * azimuth)
+        depths[:, rows] += mean.reshape(L, -1, J, 3) @ away
+        directions[rows] += weight[rows] * np.exp(2j * azimuth)
     return Expectation(
         counts,
         sums,
@@ -119,8 +121,9 @@ def expectation(
         means,
         coefficients.swapaxes(0, 1),
         from_frequencies(seen_images.swapaxes(0, 1), axis=1).reshape(n, L, J, 2),
+        from_frequencies(depths.swapaxes(0, 1), axis=1),
         # Relative to each window's own uncertainty: an ambiguous azimuth does not hide an axis.
-        float(abs(axes.sum()) / max(abs(axes).sum(), 1e-12)),
+        float(abs(directions.sum()) / max(abs(directions).sum(), 1e-12)),
         float(log_density.mean()) - J * L * math.log(2 * math.pi),
     )
 
@@ -179,6 +182,12 @@ def prior_of(
         variances=np.stack([variances for _, variances in spectra]),
         weights=(counts + 1) / (counts + 1).sum(),
     )
+
+
+def _covariances(component: Component) -> np.ndarray:
+    """Return covariances of the coefficients at each frequency, (L, P, P)."""
+    V = component.directions[component.band]
+    return (V * component.variances[:, None, :]) @ V.swapaxes(1, 2)
 
 
 def _directions(covariances: np.ndarray, band: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -48,6 +48,7 @@ def motion_prior_from_tracks(
     start: np.ndarray | None = None,
     noise: float = 0.01,
     elevations: tuple[float, float] = _ELEVATIONS,
+    distance: float | None = None,
     azimuths: int = 24,
     iterations: int = 12,
     seed: int = 0,
@@ -79,6 +80,9 @@ def motion_prior_from_tracks(
         Standard deviation σ of the keypoints, metres.
     elevations : tuple of float
         Range of the cameras' elevations above the horizon, radians.
+    distance : float, optional
+        Distance of perspective cameras from the origin, metres; the projection is linearised at the
+        posterior mean. Orthographic by default.
     azimuths : int
         Number of azimuths in the grid of views, and of the prior's headings.
     iterations : int
@@ -100,6 +104,8 @@ def motion_prior_from_tracks(
     check_count("iterations", iterations)
     check_count("azimuths", azimuths, 4)
     check_positive("noise", noise)
+    if distance is not None:
+        check_positive("distance", distance)
     if len(windows) < components:
         raise ValueError(
             f"components must be at most the number of windows, {len(windows)}, got {components}; "
@@ -111,7 +117,7 @@ def motion_prior_from_tracks(
     check_finite("start", start)
     levels = elevation_levels(elevations)
     missing = np.isnan(windows)
-    images = _interpolated(windows)
+    images = keypoints = _interpolated(windows)
     prior = _initial(images, start, skeleton, fps, azimuths)
     towards = None
     with progress_bar(iterations * (1 if components == 1 else 2), "EM", progress) as bar:
@@ -124,6 +130,10 @@ def motion_prior_from_tracks(
             for _ in range(iterations):
                 expected = expectation(prior, images, levels, noise)
                 check_view_directions("tracks", expected.azimuth_concentration)
+                if distance is not None:
+                    # A pinhole at distance D sees x D / (D + z) at depth z.
+                    ratios = np.maximum(1 + expected.depths / distance, 0.1)
+                    images = keypoints * ratios[..., None]
                 images = np.where(missing, expected.images, images)
                 prior = maximisation(expected, prior, towards, _PSEUDO_WINDOWS)
                 bar.update()
@@ -131,6 +141,7 @@ def motion_prior_from_tracks(
         tracks=len(tracks),
         windows=len(windows),
         noise=noise,
+        distance=distance,
         elevations=[float(level) for level in levels],
         log_density=expected.log_density,
     )

@@ -3,7 +3,7 @@
     python notebooks/ablations/mas.py --out mas
     python notebooks/ablations/mas.py --quick --out quick    (synthetic walks, tiny networks, 1 min)
 
-``--parts`` selects table, strided and exact. The package includes the networks of walk2d; the
+``--parts`` selects table, tracks, strided and exact. The package includes the networks of walk2d; the
 lifter is trained here on the same tracks. Draws are stored in ``--out/comparisons``, views of the
 2D model and lifted motions in ``--out/motions``; run the same command again to resume an
 interrupted study. Clips are read from ``--data``, by default ../shared/data of the repository.
@@ -47,6 +47,7 @@ from probmotion.models.evaluation.track_autoencoder import EvaluatorSettings
 from probmotion.models.training.settings import TrainingSettings
 from probmotion.models.training.track_batches import Augmentation
 from probmotion.models.training.trainer import train
+from probmotion.models.unseen_depth import motion_prior_from_tracks
 from probmotion.motion.distances import mirrored_fraction, nearest_distances, windows
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
@@ -377,6 +378,30 @@ def lifters(study: Study) -> Mapping[str, PoseLifter | Predictions | Flat]:
     return named
 
 
+def tracks(study: Study) -> pd.DataFrame:
+    """Return the metrics of draws of spectral mixtures learnt by EM from the same 2D tracks."""
+    filming, real = Filming(), study.motions("test")
+    elevations = (filming.elevation - filming.tilt, filming.elevation + filming.tilt)
+    rows = []
+    for components in (1, 8):
+        start = time.perf_counter()
+        prior = motion_prior_from_tracks(
+            study.tracks.train,
+            study.frames,
+            components=components,
+            elevations=elevations,
+            distance=filming.distance,
+        )
+        fitted = time.perf_counter()
+        drawn = prior.sample(seeds.generator(SEED, "tracks"), study.draws)
+        seconds = (time.perf_counter() - fitted) / study.draws
+        name = f"spectral mixture, K = {components}"
+        rows.append(score(study, name, drawn, None, real, seconds))
+        rows[-1]["fit_seconds"] = fitted - start
+        print(rows[-1], flush=True)
+    return pd.DataFrame(rows)
+
+
 def strided(study: Study) -> pd.DataFrame:
     """Return the metrics of MAS and mvpc at fewer noise levels than in training."""
     real = study.motions("test")
@@ -451,7 +476,7 @@ def exact(study: Study) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-PARTS = {"table": table, "strided": strided, "exact": exact}
+PARTS = {"table": table, "tracks": tracks, "strided": strided, "exact": exact}
 
 
 def main() -> None:

@@ -33,7 +33,7 @@ from probmotion.data.joint_filters import filled_between, kalman_smooth, savitzk
 from probmotion.files import written_whole
 from probmotion.io.recordings import read_recording
 from probmotion.metrics import accuracy
-from probmotion.models import GaussianMixtureMotion
+from probmotion.models import GaussianMixtureMotion, SpectralMixtureMotion
 from probmotion.models.bodies.body_states import BodyStates, rest_pose
 from probmotion.models.dvae.denoiser_training import DenoiserTrainee, usual_denoiser_training
 from probmotion.models.dvae.joint_noise import JointNoise
@@ -42,6 +42,7 @@ from probmotion.models.dvae.motion_dvae import MotionDVAE
 from probmotion.models.dvae.noisy_windows import Stitching
 from probmotion.models.dvae.settings import DVAESettings
 from probmotion.models.dvae.training import DVAETrainee, usual_dvae_training
+from probmotion.models.spectral.denoising import denoise_joints
 from probmotion.models.training.checkpoints import weights_digest
 from probmotion.models.training.trainer import train
 from probmotion.motion.motion import Motion
@@ -221,6 +222,29 @@ def mixture(study: Study) -> Estimate:
     return estimate
 
 
+def spectral(study: Study) -> Estimate:
+    """Return a function that computes the exact mean under a spectral mixture."""
+    shipped = None if study.quick else SpectralMixtureMotion.load("cmu-motion")
+    known = shipped or SpectralMixtureMotion.fit(study.clips["train"], 30, progress=False)
+
+    def estimate(recording: Recording) -> np.ndarray:
+        observed = recording.observed
+        found = denoise_joints(
+            observed.joints,
+            observed.entries.confidence,
+            skeleton=known.skeleton,
+            fps=recording.truth.fps,
+            noise=observed.noise,
+            degrees_of_freedom=observed.degrees_of_freedom,
+            draws=0,
+            progress=False,
+            prior=known,
+        )
+        return found.mean
+
+    return estimate
+
+
 def estimates(study: Study) -> dict[str, Estimate]:
     """Return the denoising methods by name."""
     fit = DVAEInference(mode="optimization", iterations=50)
@@ -234,6 +258,7 @@ def estimates(study: Study) -> dict[str, Estimate]:
         "Savitzky-Golay": filtered,
         "Kalman smoother": smoothed,
         "Gaussian mixture, exact mean": known,
+        "spectral mixture, exact mean": spectral(study),
         "regression": study.dvae(regression),
         "optimization": study.dvae(fit),
         "optimization, 100 iterations": study.dvae(replace(fit, iterations=100)),

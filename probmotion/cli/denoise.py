@@ -17,7 +17,6 @@ __all__ = ["Denoise"]
 
 _OUTLIERS = 3.0  # degrees of freedom of Student-t noise
 _LARGEST_NOISE = 1.0  # metres
-_COVERED = ("person14", "coco17")  # skeletons of the prior
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +53,7 @@ class Denoise(Conventions):
 
     def run(self) -> None:
         from probmotion.files import writable_folder
+        from probmotion.io.errors import errors_in
         from probmotion.io.files import read_joints
         from probmotion.models.spectral.denoising import denoise_joints
         from probmotion.motion.skeleton import Skeleton
@@ -69,8 +69,8 @@ class Denoise(Conventions):
         check_count("draws", self.draws)
         check_count("seed", self.seed, least=0)
         track = read_joints(self.file, **self.conventions())
-        if track.skeleton not in [Skeleton.preset(name) for name in _COVERED]:
-            track = _on_person14(track, self.file)
+        with errors_in(self.file):
+            track = track.retarget(Skeleton.preset("person14"))
         writable_folder(self.out)
         result = denoise_joints(
             track.joints,
@@ -89,14 +89,6 @@ class Denoise(Conventions):
             f"wrote {self.out / 'denoised.npz'} (mean, standard deviation and {self.draws} draws) "
             f"and {self.out / 'mean.bvh'} (mean)"
         )
-
-
-def _on_person14(track: JointTrack, path: Path) -> JointTrack:
-    from probmotion.io.errors import errors_in
-    from probmotion.motion.skeleton import Skeleton
-
-    with errors_in(path):
-        return track.retarget(Skeleton.preset("person14"))
 
 
 def _write(track: JointTrack, result: Any, out: Path) -> None:

@@ -15,6 +15,7 @@ from probmotion.problems.denoising import DENOISING_PROBLEMS
 from probmotion.problems.gait import GAIT_OUTLIER_PROBLEMS, GAIT_PROBLEMS
 from probmotion.problems.learnt import LEARNT_PROBLEMS
 from probmotion.problems.pairs import PAIR_PROBLEMS
+from probmotion.problems.real_motion import REAL_MOTION_PROBLEMS
 from probmotion.problems.references.store import find_reference
 from probmotion.threads import one_thread
 from probmotion.validation import did_you_mean
@@ -28,7 +29,13 @@ __all__ = [
 ]
 
 _GAITS = {**GAIT_PROBLEMS, **GAIT_OUTLIER_PROBLEMS}
-_OTHER_PROBLEMS = {**CLIP_PROBLEMS, **PAIR_PROBLEMS, **LEARNT_PROBLEMS, **DENOISING_PROBLEMS}
+_OTHER_PROBLEMS = {
+    **CLIP_PROBLEMS,
+    **PAIR_PROBLEMS,
+    **LEARNT_PROBLEMS,
+    **DENOISING_PROBLEMS,
+    **REAL_MOTION_PROBLEMS,
+}
 _SCALED = re.compile(r"(?P<name>[^()]+)\((?P<scale>[^()]*)\)")  # e.g. gait(frames=20)
 
 

@@ -86,15 +86,19 @@ def test_files_and_summary(calls, capsys, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["h36m17", "coco17"])
-def test_skeletons_are_those_of_the_prior_or_retargeted(name, calls, tmp_path):
+def test_other_skeletons_are_retargeted(name, calls, tmp_path):
     skeleton = Skeleton.preset(name)
     source = [PERSON.index(n) if n in PERSON.joint_names else NECK for n in skeleton.joint_names]
     np.savez(tmp_path / "walk.npz", positions=WALK[:, source], fps=30.0,
              joint_names=skeleton.joint_names, parents=skeleton.parents)  # fmt: skip
     assert main(["denoise", str(tmp_path / "walk.npz"), "--out", str(tmp_path)]) == 0
     ((given, _, options),) = calls
-    assert options["skeleton"] == (skeleton if name == "coco17" else PERSON)
-    np.testing.assert_array_equal(given, WALK[:, source] if name == "coco17" else WALK)
+    assert options["skeleton"] == PERSON
+    missing = [joint for joint in PERSON.joint_names if joint not in skeleton.joint_names]
+    assert missing == (["pelvis", "neck"] if name == "coco17" else [])
+    expected = WALK.copy()
+    expected[:, [PERSON.index(joint) for joint in missing]] = np.nan
+    np.testing.assert_array_equal(given, expected)
 
 
 def test_invalid_input_is_one_sentence(calls, fails, tmp_path):

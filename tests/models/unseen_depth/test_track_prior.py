@@ -16,7 +16,7 @@ from probmotion.data.tracks.learning import film_clips
 from probmotion.models.spectral import SpectralMixtureMotion
 from probmotion.models.spectral.spectrum import bands, to_frequencies
 from probmotion.models.unseen_depth import motion_prior_from_tracks
-from probmotion.models.unseen_depth.track_em import expectation, maximisation
+from probmotion.models.unseen_depth.track_em import expectation, maximisation, moments
 
 BODY = Skeleton(["hips", "head", "left_hand", "right_hand"], [-1, 0, 0, 0])
 POSE = np.array([[0, 0, 0.1], [0, 0.6, -0.1], [0.4, 0.1, 0.3], [-0.4, 0.1, 0.3]])
@@ -105,7 +105,7 @@ def test_e_step_agrees_with_dense_linear_algebra() -> None:
     logs = np.stack([cell[1] for cell in cells])
     total = logsumexp(logs, axis=0)
     assert got.log_density == pytest.approx(total.mean(), abs=1e-8)
-    weights = np.exp(logs - total)
+    weights = np.exp(logs - logs.max(axis=0))
     weights[weights < 1e-3] = 0  # as in the E step
     weights /= weights.sum(axis=0)
     sums, squares = np.zeros((2, L * 3 * J)), np.zeros((2, L * 3 * J, L * 3 * J))
@@ -120,6 +120,21 @@ def test_e_step_agrees_with_dense_linear_algebra() -> None:
     np.testing.assert_allclose(got.squares, blocks, atol=1e-8)
     np.testing.assert_allclose(got.coefficients.reshape(n, -1), coefficients, atol=1e-8)
     np.testing.assert_allclose(to_frequencies(got.images, axis=1).reshape(n, -1), seen, atol=1e-8)
+
+
+def test_moments_are_those_about_the_fitted_mean() -> None:
+    prior, rng = random_prior(10), np.random.default_rng(6)
+    expected = expectation(prior, images_of(prior, 30, 0.05), ELEVATIONS, 0.05)
+    motions = expected.means[0] + 0.1 + rng.normal(size=(30, 10, 12))
+    deviations = motions - expected.means[0]
+    squares = np.einsum("nfp,nfq->fpq", deviations, deviations)
+    sums = deviations.sum(axis=0)[None]
+    expected = expected._replace(counts=np.array([30.0]), sums=sums, squares=squares[None])
+    fitted = maximisation(expected, prior)
+    mean = to_frequencies(fitted.components.gaussians[0].mean, axis=0).reshape(10, 12)
+    known = np.einsum("nfp,nfq->fpq", motions - mean, motions - mean)
+    bands = moments(expected, prior.fps)[0].bands
+    np.testing.assert_allclose(40 * bands - 10 * 0.005**2 * np.eye(12), known, atol=1e-9)
 
 
 @pytest.mark.parametrize("components", [1, 2])
@@ -139,7 +154,7 @@ def test_likelihood_increases(components: int) -> None:
 def test_recovers_a_known_gaussian() -> None:
     truth = random_prior(10)
     elevations = np.array([0.15])
-    images = images_of(truth, 1500, 0.01, elevations)
+    images = images_of(truth, 1000, 0.01, elevations)
     rng = np.random.default_rng(4)
     missing = rng.random(images.shape[:3]) < 0.02
     fitted = motion_prior_from_tracks(
@@ -149,7 +164,7 @@ def test_recovers_a_known_gaussian() -> None:
         start=POSE + 0.03 * rng.normal(size=POSE.shape),
         elevations=(0.14, 0.16),
         azimuths=12,
-        iterations=40,
+        iterations=30,
     )
     np.testing.assert_allclose(fitted.poses, truth.poses, atol=0.02)
     np.testing.assert_allclose(fitted.velocities, truth.velocities, atol=0.1)
@@ -160,6 +175,25 @@ def test_recovers_a_known_gaussian() -> None:
         if f == 0:  # the translations are not learnt
             known, found = (V[:, 2:].T @ part @ V[:, 2:] for part in (known, found))
         assert np.linalg.norm(found - known) < 0.2 * np.linalg.norm(known)
+
+
+def test_perspective_of_a_known_distance_is_corrected() -> None:
+    rng = np.random.default_rng(5)
+    truth = random_prior(10)
+    truth = replace(truth, velocities=np.zeros((1, 2)), ground=0.01)
+    n = 300
+    cameras = Cameras.around(np.zeros(n), np.full(n, 0.15), distance=2.0, perspective=True)
+    motions = truth.sample(rng, n)
+    images = np.stack([cameras.project(x)[i] for i, x in enumerate(motions)])
+    options = {"components": 1, "start": POSE, "elevations": (0.14, 0.16), "azimuths": 12}
+    plain, corrected = (
+        motion_prior_from_tracks(as_tracks(images), 10, distance=distance, **options)
+        for distance in (None, 2.0)
+    )
+    scores = [prior.log_prior(motions).mean() for prior in (plain, corrected, truth)]
+    assert scores[0] < scores[1] < scores[2]
+    errors = [np.abs(prior.poses - truth.poses).max() for prior in (plain, corrected)]
+    assert errors[1] < errors[0] / 2
 
 
 def test_draws_of_walks_move_at_the_speed_of_the_walks() -> None:
