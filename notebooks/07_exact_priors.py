@@ -26,6 +26,7 @@
 # On Colab, first run `%pip install git+https://github.com/probmotion/probmotion`.
 
 # %%
+import os
 import time
 from pathlib import Path
 
@@ -122,7 +123,7 @@ fig.tight_layout()
 # joints are too narrow, and the gain over a Kalman smoother, which knows nothing about bodies, shrinks or is lost.
 
 # %%
-data = Path("../../shared/data")
+data = Path(os.environ.get("PROBMOTION_DATA", "../shared/data"))
 rows = {"walk (held out)": row}
 for name, path in (
     ("soccer (action kept out)", data / "cmu_actions" / "soccer_1.npz"),
@@ -139,6 +140,6 @@ pd.DataFrame(rows).round(2)
 # The prior is a prior like any other: every sampler runs on it, and its error is known.
 
 # %%
-problem = pm.problem("cmu-motion-monocular")
+problem = pm.problem("cmu-motion")
 draws = pm.sample(problem, "exact", draws=400, seed=0)
 print(pm.score(problem, draws))

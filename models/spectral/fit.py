@@ -14,7 +14,13 @@ from probmotion.models.bodies.body_states import turned_about_vertical
 from probmotion.models.mixture.fit import cut_windows
 from probmotion.models.spectral.conditioning import turned
 from probmotion.models.spectral.rotated_spectra import RotatedSpectra
-from probmotion.models.spectral.spectrum import bands, ramp, to_frequencies
+from probmotion.models.spectral.spectrum import (
+    bands,
+    principal_directions,
+    ramp,
+    to_frequencies,
+    translations,
+)
 from probmotion.motion.motion import Motion
 from probmotion.posteriors.sampling import progress_bar
 from probmotion.validation import check_count
@@ -28,7 +34,7 @@ _GLOBAL_WEIGHT = 0.05  # of the component of all windows
 _INDEPENDENT = (0.1, 0.02)
 """Weight of independent coordinates in covariances, at frequency 0 and at others: correlations of
 postures are estimated from few clips, and are too large for motion that is unlike them."""
-_FLOOR = 1e-8  # smallest variance of a coefficient, square metres
+_FLOOR = 1e-8  # keeps activities of still windows finite, square metres
 _LOW = 3  # frequencies that describe a window for clustering
 SCALES = np.array([0.25, 1.0, 4.0])
 """Factors of the variances: motion is calmer or livelier than that of the component's windows."""
@@ -113,7 +119,7 @@ def _moments(coefficients: np.ndarray, fps: float, azimuths: int) -> Moments:
         n *= 2
     pose = coefficients[:, 0].mean(axis=0) / math.sqrt(L)
     slope = ramp(L, fps)
-    along = _translations(P // 3)
+    along = translations(P // 3)
     # Least squares of the mean path's coefficients on those of a ramp.
     path = coefficients.mean(axis=0) @ along / math.sqrt(P // 3)
     square = slope @ slope
@@ -126,16 +132,9 @@ def _moments(coefficients: np.ndarray, fps: float, azimuths: int) -> Moments:
 def _mean(pose: np.ndarray, velocity: np.ndarray, L: int, fps: float) -> np.ndarray:
     """Return the coefficients of a pose that moves at a velocity, (L, P)."""
     J = len(pose) // 3
-    mean = math.sqrt(J) * ramp(L, fps)[:, None] * (_translations(J) @ velocity)
+    mean = math.sqrt(J) * ramp(L, fps)[:, None] * (translations(J) @ velocity)
     mean[0] += math.sqrt(L) * pose
     return mean
-
-
-def _translations(J: int) -> np.ndarray:
-    """Return the unit translations along x and z, (P, 2)."""
-    out = np.zeros((J, 3, 2))
-    out[:, 0, 0] = out[:, 2, 1] = 1 / math.sqrt(J)
-    return out.reshape(-1, 2)
 
 
 def _component(moments: Moments) -> dict[str, np.ndarray]:
@@ -143,26 +142,12 @@ def _component(moments: Moments) -> dict[str, np.ndarray]:
     L, P, _ = moments.bands.shape
     share = np.where(np.arange(L) == 0, *_INDEPENDENT)[:, None, None]
     covariances = moments.bands * (1 - share + share * np.eye(P))
-    band = bands(L)
-    directions = np.empty((band[-1] + 1, P, P))
-    variances = np.empty((L, P))
-    along = _translations(P // 3)
-    # At frequency 0 the translations come first; the others are principal directions of their
-    # complement.
-    complement = np.linalg.qr(along, mode="complete")[0][:, 2:]
-    _, axes = np.linalg.eigh(complement.T @ covariances[0] @ complement)
-    directions[0] = np.concatenate([along, complement @ axes[:, ::-1]], axis=1)
-    for index in range(band[-1] + 1):
-        own = covariances[band == index]
-        if index > 0:
-            directions[index] = np.linalg.eigh(own.mean(axis=0))[1][:, ::-1]
-        V = directions[index]
-        variances[band == index] = np.einsum("pi,fpq,qi->fi", V, own, V, optimize=True)
+    directions, variances = principal_directions(covariances, bands(L))
     return {
         "poses": moments.pose.reshape(-1, 3),
         "velocities": moments.velocity,
         "directions": directions,
-        "variances": np.maximum(variances, _FLOOR),
+        "variances": variances,
     }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -100,8 +100,8 @@ def draw(
 
 def _conditioned(
     components: Components, information: Information, shift: np.ndarray
-) -> Iterator[tuple]:
-    """Yield per component: index, azimuths, their log terms (n, a), and the weighted mean's sum."""
+) -> Iterator[tuple[int, slice, np.ndarray, Callable[[np.ndarray], np.ndarray]]]:
+    """Yield per component: index, azimuths, their log terms (n, a), and a sum of weighted means."""
     if information.isotropic:
         # P does not depend on the azimuth: three base fields of η give all azimuths.
         fields = rotation_fields(shift.reshape(len(shift), -1, 3)).swapaxes(0, 1)
@@ -120,7 +120,8 @@ def _conditioned(
                 solved[2] += component.mean
                 base = np.einsum("nij,jnltx->inltx", sums, solved, optimize=True)
                 rotated = rotation_fields(base.reshape(3, len(weights), -1, 3))
-                return sum(rotated[i, :, i] for i in range(3)).reshape(solved.shape[1:])
+                total: np.ndarray = rotated[0, :, 0] + rotated[1, :, 1] + rotated[2, :, 2]
+                return total.reshape(solved.shape[1:])
 
             yield c, slice(None), log_terms, means
         return
@@ -131,12 +132,13 @@ def _conditioned(
             conditional = Conditional(component, local)
             terms, solved = _solve(component, conditional, local, fields, np.ones((1, 1)))
             clean = turned(solved[0] + component.mean, yaw)
-            yield (
-                c,
-                slice(a, a + 1),
-                terms + components.log_weights[c],
-                lambda weights, clean=clean: weights[:, :, None, None] * clean,
-            )
+            yield c, slice(a, a + 1), terms + components.log_weights[c], partial(_weighted, clean)
+
+
+def _weighted(motions: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return motions times weights: ``(n, L, J, 3), (n, 1) → (n, L, J, 3)``."""
+    product: np.ndarray = weights[:, :, None, None] * motions
+    return product
 
 
 def _solve(
@@ -227,16 +229,23 @@ class SpectralPosterior:
 
     def covariances(self) -> np.ndarray:
         """Return the covariance matrix of each entry given y, (L, J, 3, 3), square metres."""
+        probabilities = self.component_probabilities
+        information = Information.of(self.information)
         mean = self.mean()
         total = np.zeros((*mean.shape, 3))
-        for weight, c, a in self._active():
-            component, conditional, local_shift, R = self._conditional(c, a)
-            centre = component.mean + self._deviation(component, conditional, local_shift)
-            difference = centre @ R.T - mean
-            total += weight * (
-                R @ conditional.marginals @ R.T
-                + difference[..., :, None] * difference[..., None, :]
-            )
+        for c, component in enumerate(self.components.gaussians):
+            conditional = None
+            for a in np.flatnonzero(probabilities[c] > _NEGLIGIBLE).tolist():
+                R = rotation(self.components.yaws[a])
+                if not information.isotropic:
+                    conditional = Conditional(component, information.rotated(R))
+                elif conditional is None:
+                    conditional = Conditional(component, information)
+                pull = np.einsum("ljab,ljb->lja", conditional.information.all, component.mean)
+                centre = component.mean + conditional.solve((self.shift @ R - pull)[None])[0]
+                difference = centre @ R.T - mean
+                between = difference[..., :, None] * difference[..., None, :]
+                total += probabilities[c, a] * (R @ conditional.marginals @ R.T + between)
         return total
 
     def sample(self, rng: np.random.Generator, n: int) -> np.ndarray:
@@ -252,37 +261,3 @@ class SpectralPosterior:
             return value
         evidence = self.log_marginal_likelihood
         return value + self.likelihood.log_density(positions) - evidence
-
-    def _active(self) -> Iterator[tuple[float, int, int]]:
-        """Yield probability, component and azimuth of all that contribute to moments."""
-        probabilities = self.component_probabilities
-        for c, a in zip(*np.nonzero(probabilities > _NEGLIGIBLE), strict=True):
-            yield float(probabilities[c, a]), int(c), int(a)
-
-    def _conditional(self, c: int, a: int) -> tuple[Component, Conditional, np.ndarray, np.ndarray]:
-        """Return a component, its conditional, η in its frame, and its rotation matrix."""
-        component = self.components.gaussians[c]
-        R = rotation(self.components.yaws[a])
-        information = self._information
-        if not information.isotropic:
-            information = information.rotated(R)
-        key = c if self._information.isotropic else (c, a)
-        if key not in self._conditionals:
-            self._conditionals[key] = Conditional(component, information)
-        return component, self._conditionals[key], self.shift @ R, R
-
-    @cached_property
-    def _information(self) -> Information:
-        return Information.of(self.information)
-
-    @cached_property
-    def _conditionals(self) -> dict:
-        return {}
-
-    def _deviation(
-        self, component: Component, conditional: Conditional, shift: np.ndarray
-    ) -> np.ndarray:
-        """Return E[X | y, c, a] − m in the component's frame, (L, J, 3)."""
-        information = conditional.information.all
-        pull = np.einsum("ljab,ljb->lja", information, component.mean)
-        return conditional.solve((shift - pull)[None])[0]

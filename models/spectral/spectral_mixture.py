@@ -35,6 +35,7 @@ from probmotion.models.spectral.spectrum import (
     ramp,
     resampled,
     to_frequencies,
+    translations,
 )
 from probmotion.models.spectral.view_spectra import ViewSpectra
 from probmotion.motion.motion import Motion
@@ -486,9 +487,7 @@ def _orthonormal(directions: np.ndarray) -> np.ndarray:
     """Return the nearest orthonormal columns; the translations stay exact: (K, B, P, P)."""
     left, _, right = np.linalg.svd(directions)
     out = left @ right
-    J = directions.shape[2] // 3
-    fixed = np.zeros((3 * J, 2))
-    fixed[0::3, 0] = fixed[2::3, 1] = 1 / math.sqrt(J)
+    fixed = translations(directions.shape[2] // 3)
     free = directions[:, 0, :, 2:]
     left, _, right = np.linalg.svd(free - fixed @ (fixed.T @ free), full_matrices=False)
     out[:, 0] = np.concatenate([np.broadcast_to(fixed, (len(out), *fixed.shape)), left @ right], -1)

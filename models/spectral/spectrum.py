@@ -5,10 +5,22 @@ The orthonormal DCT-II of L frames has the frequencies ν_f = f · fps / (2 L), 
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from scipy.fft import dct, idct
 
-__all__ = ["bands", "from_frequencies", "ramp", "resampled", "to_frequencies"]
+__all__ = [
+    "bands",
+    "from_frequencies",
+    "principal_directions",
+    "ramp",
+    "resampled",
+    "to_frequencies",
+    "translations",
+]
+
+_FLOOR = 1e-8  # smallest variance of a coefficient, square metres
 
 
 def to_frequencies(values: np.ndarray, axis: int) -> np.ndarray:
@@ -55,3 +67,34 @@ def resampled(
     factor[above] *= (fps / 2 / new[above]) ** 4
     factor[0] = frames / variances.shape[1]
     return variances[:, nearest] * factor[:, None], band[nearest]
+
+
+def translations(n_joints: int) -> np.ndarray:
+    """Return the unit translations of all joints along x and z, (3 J, 2)."""
+    out = np.zeros((n_joints, 3, 2))
+    out[:, 0, 0] = out[:, 2, 1] = 1 / math.sqrt(n_joints)
+    return out.reshape(-1, 2)
+
+
+def principal_directions(
+    covariances: np.ndarray, band: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return directions of each band, (B, P, P), and variances in them, (L, P).
+
+    ``covariances`` (L, P, P) are those of the coefficients of each frequency, ``band`` (L,) its
+    band. Directions are the principal ones of a band's mean covariance; at frequency 0 the ground
+    translations come first. Variances are at least 10⁻⁸ m².
+    """
+    L, P, _ = covariances.shape
+    directions, variances = np.empty((band[-1] + 1, P, P)), np.empty((L, P))
+    along = translations(P // 3)
+    complement = np.linalg.qr(along, mode="complete")[0][:, 2:]
+    axes = np.linalg.eigh(complement.T @ covariances[0] @ complement)[1]
+    directions[0] = np.concatenate([along, complement @ axes[:, ::-1]], axis=1)
+    for index in range(band[-1] + 1):
+        own = covariances[band == index]
+        if index > 0:
+            directions[index] = np.linalg.eigh(own.mean(axis=0))[1][:, ::-1]
+        V = directions[index]
+        variances[band == index] = np.einsum("pi,fpi->fi", V, own @ V)
+    return directions, np.maximum(variances, _FLOOR)

@@ -55,7 +55,7 @@ class ViewSpectra:
         for rows, block in blocks(y):
             weights, means = self._condition(block, variance)
             n = rows.stop - rows.start
-            mean = sum(weights[c, :, None, None] * part for c, part in means)
+            mean = np.sum([weights[c, :, None, None] * part for c, part in means], axis=0)
             out[rows] = mean[:n].reshape(n, *y.shape[1:])
         return out
 
@@ -65,7 +65,7 @@ class ViewSpectra:
         for (rows, block), (_, direction) in zip(blocks(y), blocks(vectors), strict=True):
             weights, means = self._condition(block, variance)
             flat = direction.reshape(len(direction), *self._means.shape[1:])
-            mean = sum(weights[c, :, None, None] * part for c, part in means)
+            mean = np.sum([weights[c, :, None, None] * part for c, part in means], axis=0)
             total = np.zeros_like(flat)
             for c, part in means:
                 gain = variance * self._sizes[c] / (self._sizes[c] + variance)
@@ -92,14 +92,11 @@ class ViewSpectra:
         weights = np.exp(logits - logits.max(axis=0))
         weights /= weights.sum(axis=0)
         weights[weights < _NEGLIGIBLE] = 0.0
-        means = [
-            (
-                c,
-                self._means[c]
-                + self._product(c, self._sizes[c] * precision[c], flat - self._means[c]),
-            )
-            for c in np.flatnonzero(weights.any(axis=1))
-        ]
+        gain = self._sizes * precision
+        means = []
+        for c in np.flatnonzero(weights.any(axis=1)).tolist():
+            deviation = self._product(c, gain[c], flat - self._means[c])
+            means.append((c, self._means[c] + deviation))
         return weights, means
 
     def _product(self, c: int, gain: np.ndarray, vectors: np.ndarray) -> np.ndarray:

@@ -18,14 +18,19 @@ from probmotion.geometry.cameras import Cameras
 from probmotion.models.spectral.conditioning import Component, rotation
 from probmotion.models.spectral.fit import Moments
 from probmotion.models.spectral.spectral_mixture import SpectralMixtureMotion
-from probmotion.models.spectral.spectrum import from_frequencies, ramp, to_frequencies
+from probmotion.models.spectral.spectrum import (
+    from_frequencies,
+    principal_directions,
+    ramp,
+    to_frequencies,
+    translations,
+)
 
 __all__ = ["Expectation", "expectation", "maximisation", "moments", "prior_of"]
 
 _LEAST_WEIGHT = 1e-3  # less probable views, relative to the most probable one, are left out
 _PSEUDO_WINDOWS = 10  # weight of the white covariance, in windows
 _WHITE = 0.005  # its standard deviation, metres
-_FLOOR = 1e-8  # smallest variance of a coefficient, square metres
 
 
 class Expectation(NamedTuple):
@@ -132,7 +137,7 @@ def moments(expected: Expectation, fps: float) -> list[Moments]:
     """Return the moments of each component, shrunk by a little white variance."""
     result = []
     L, P = expected.sums.shape[1:]
-    along, slope = _translations(P // 3), ramp(L, fps)
+    along, slope = translations(P // 3), ramp(L, fps)
     for k, count in enumerate(np.maximum(expected.counts, 1e-12)):
         shift = expected.sums[k] / count
         mean = expected.means[k] + shift
@@ -173,7 +178,7 @@ def prior_of(
     parts: list[Moments], counts: np.ndarray, prior: SpectralMixtureMotion
 ) -> SpectralMixtureMotion:
     """Return a prior with the moments of each component, otherwise as ``prior``."""
-    spectra = [_directions(part.bands, prior.band) for part in parts]
+    spectra = [principal_directions(part.bands, prior.band) for part in parts]
     return replace(
         prior,
         poses=np.stack([part.pose.reshape(-1, 3) for part in parts]),
@@ -188,28 +193,3 @@ def _covariances(component: Component) -> np.ndarray:
     """Return covariances of the coefficients at each frequency, (L, P, P)."""
     V = component.directions[component.band]
     return (V * component.variances[:, None, :]) @ V.swapaxes(1, 2)
-
-
-def _directions(covariances: np.ndarray, band: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return directions (B, P, P) of each band of frequencies, and variances (L, P) in them."""
-    L, P, _ = covariances.shape
-    directions, variances = np.empty((band[-1] + 1, P, P)), np.empty((L, P))
-    # At frequency 0 the translations come first, then directions of their complement.
-    along = _translations(P // 3)
-    complement = np.linalg.qr(along, mode="complete")[0][:, 2:]
-    axes = np.linalg.eigh(complement.T @ covariances[0] @ complement)[1]
-    directions[0] = np.concatenate([along, complement @ axes[:, ::-1]], axis=1)
-    for index in range(band[-1] + 1):
-        own = covariances[band == index]
-        if index > 0:
-            directions[index] = np.linalg.eigh(own.mean(axis=0))[1][:, ::-1]
-        V = directions[index]
-        variances[band == index] = np.einsum("pi,fpi->fi", V, own @ V)
-    return directions, np.maximum(variances, _FLOOR)
-
-
-def _translations(J: int) -> np.ndarray:
-    """Return the unit translations along x and z, (P, 2)."""
-    out = np.zeros((J, 3, 2))
-    out[:, 0, 0] = out[:, 2, 1] = 1 / math.sqrt(J)
-    return out.reshape(-1, 2)
