@@ -195,3 +195,14 @@ def test_compare_and_calibrate(tmp_path, monkeypatch):
     exact, narrow = (line for line in printed.splitlines() if " on gait-monocular(" in line)
     assert "no deviation found" in exact
     assert "overconfident: 90 % intervals" in narrow
+
+
+@pytest.mark.slow
+def test_exact_priors(tmp_path, monkeypatch):
+    printed = run("07_exact_priors.py", tmp_path, 1, monkeypatch)
+    seen, smoother = (
+        float(re.search(rf"^{name}, mm +([\d.]+)", printed, re.MULTILINE)[1])
+        for name in ("seen", "seen, smoother")
+    )
+    assert seen < smoother
+    assert "exact on cmu-motion: right" in printed
