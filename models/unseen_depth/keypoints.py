@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,10 +15,11 @@ __all__ = ["AnnotationLifts", "as_keypoints", "centred_images", "visibility_grou
 _LEAST_VISIBLE = 2  # a single joint says nothing about the pose, since positions are unknown
 
 
-class AnnotationLifts(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class AnnotationLifts:
     """Posterior of the 3D poses of n annotations, in the axes of their cameras.
 
-    Attributes
+    Parameters
     ----------
     positions : ndarray, (n, J, 3)
         Posterior means, metres: x right, y up, both in place; z towards the viewer, relative to the
