@@ -262,5 +262,6 @@ def _log_density(fitted: dict[str, Any], coefficients: np.ndarray, fps: float) -
         log_weights,
         np.zeros(1),
     )
-    values: np.ndarray = mixture.log_density(coefficients.reshape(n, L, P // 3, 3))
-    return values
+    fields = coefficients.reshape(n, L, P // 3, 3)
+    # Blocks of windows whose products fit into a cache.
+    return np.concatenate([mixture.log_density(fields[i : i + 16]) for i in range(0, n, 16)])
