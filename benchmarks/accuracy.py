@@ -44,7 +44,7 @@ from probmotion.interaction.completion import (
 from probmotion.interaction.geometry.coordinates import align_rigidly
 from probmotion.interaction.regression import ridge_completion
 from probmotion.metrics.coverage import coverage
-from probmotion.models.spectral.denoising import denoise_joints
+from probmotion.models.mixture.denoising import denoise_joints
 from probmotion.models.unseen_depth import AnnotationLifts, AnnotationPrior
 from probmotion.motion.motion import Motion
 from probmotion.posteriors.likelihoods import Joints3D

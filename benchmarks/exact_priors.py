@@ -2,7 +2,7 @@
 
 ``fit_seconds_per_hour`` is extrapolated from the training clips of the denoising study, including
 the choice of the number of components; ``posterior_ms_per_frame`` is that of
-:func:`~probmotion.models.spectral.denoising.denoise_joints` with a limb hidden a third of the time;
+:func:`~probmotion.models.mixture.denoising.denoise_joints` with a limb hidden a third of the time;
 ``denoiser_per_second`` counts 3D denoisers at a noise level in the middle of the schedule.
 """
 
@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from probmotion.data.denoising_clips import denoising_clips, synthetic_denoising_clips
-from probmotion.models.spectral.denoising import denoise_joints
-from probmotion.models.spectral.spectral_mixture import SpectralMixtureMotion
+from probmotion.models.mixture.denoising import denoise_joints
+from probmotion.models.mixture.spectral_mixture import SpectralMixtureMotion
 from probmotion.motion.motion import Motion
 from probmotion.problems.denoising import limb_occlusions
 from probmotion.threads import one_thread
@@ -85,8 +85,8 @@ def lift_rate() -> float:
     from accuracy import dances
 
     pairs = dances()
-    prior, _ = pairs.fitted(pairs.annotated(600))
-    annotations = pairs.asked(600).annotations
+    prior, _ = pairs.fitted(pairs.annotated(500))
+    annotations = pairs.asked(100).annotations
     return len(annotations) / fastest(lambda: prior.lift(annotations), 3)
 
 

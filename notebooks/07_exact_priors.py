@@ -39,7 +39,7 @@ from probmotion.data.cmu_clips import cmu_clip
 from probmotion.data.joint_filters import kalman_smooth
 from probmotion.data.synthetic.walks import synthetic_walks
 from probmotion.models import SpectralMixtureMotion
-from probmotion.models.spectral.denoising import denoise_joints
+from probmotion.models.mixture.denoising import denoise_joints
 from probmotion.plots.animation import animate_skeletons
 from probmotion.problems.denoising import limb_occlusions
 

@@ -16,7 +16,7 @@ import numpy as np
 from probmotion.data.denoising_clips import denoising_clips
 from probmotion.io.files import load
 from probmotion.models.mixture.fit import cut_windows
-from probmotion.models.spectral.spectral_mixture import SpectralMixtureMotion
+from probmotion.models.mixture.spectral_mixture import SpectralMixtureMotion
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
 from probmotion.threads import one_thread

@@ -1,4 +1,4 @@
-"""Gaussian mixture prior over motions, with exact density, denoising and posterior."""
+"""Gaussian mixtures over motions: exact density, denoisers, posterior and denoising."""
 
 import lazy_loader
 

@@ -1,3 +1,7 @@
 from .conditioned_mixture import ConditionedMixture as ConditionedMixture
+from .conditioned_spectra import ConditionedSpectra as ConditionedSpectra
+from .denoising import denoise_joints as denoise_joints
 from .gaussian_mixture import GaussianMixtureMotion as GaussianMixtureMotion
 from .posterior import MixturePosterior as MixturePosterior
+from .spectral_mixture import SpectralMixtureMotion as SpectralMixtureMotion
+from .spectral_posterior import SpectralPosterior as SpectralPosterior

@@ -15,10 +15,10 @@ import numpy as np
 
 from probmotion.arrays import logsumexp
 from probmotion.geometry.cameras import Cameras
-from probmotion.models.spectral.conditioning import Component, rotation
-from probmotion.models.spectral.fit import Moments
-from probmotion.models.spectral.spectral_mixture import SpectralMixtureMotion
-from probmotion.models.spectral.spectrum import (
+from probmotion.models.mixture.conditioning import Component, rotation
+from probmotion.models.mixture.spectral_fit import Moments
+from probmotion.models.mixture.spectral_mixture import SpectralMixtureMotion
+from probmotion.models.mixture.spectrum import (
     from_frequencies,
     principal_directions,
     ramp,

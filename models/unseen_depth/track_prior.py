@@ -13,9 +13,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from probmotion import seeds
-from probmotion.models.spectral.fit import Moments
-from probmotion.models.spectral.spectral_mixture import SpectralMixtureMotion
-from probmotion.models.spectral.spectrum import bands, to_frequencies
+from probmotion.models.mixture.spectral_fit import Moments
+from probmotion.models.mixture.spectral_mixture import SpectralMixtureMotion
+from probmotion.models.mixture.spectrum import bands, to_frequencies
 from probmotion.models.unseen_depth.track_em import (
     Expectation,
     expectation,

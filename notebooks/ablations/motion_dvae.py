@@ -42,7 +42,7 @@ from probmotion.models.dvae.motion_dvae import MotionDVAE
 from probmotion.models.dvae.noisy_windows import Stitching
 from probmotion.models.dvae.settings import DVAESettings
 from probmotion.models.dvae.training import DVAETrainee, usual_dvae_training
-from probmotion.models.spectral.denoising import denoise_joints
+from probmotion.models.mixture.denoising import denoise_joints
 from probmotion.models.training.checkpoints import weights_digest
 from probmotion.models.training.trainer import train
 from probmotion.motion.motion import Motion

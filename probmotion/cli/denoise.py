@@ -55,7 +55,7 @@ class Denoise(Conventions):
         from probmotion.files import writable_folder
         from probmotion.io.errors import errors_in
         from probmotion.io.files import read_joints
-        from probmotion.models.spectral.denoising import denoise_joints
+        from probmotion.models.mixture.denoising import denoise_joints
         from probmotion.motion.skeleton import Skeleton
         from probmotion.validation import check_count, check_positive
 

@@ -24,7 +24,7 @@ from probmotion.problems.denoising import limb_occlusions
 from probmotion.problems.observations import observe
 
 if TYPE_CHECKING:
-    from probmotion.models.spectral.spectral_mixture import SpectralMixtureMotion
+    from probmotion.models.mixture.spectral_mixture import SpectralMixtureMotion
     from probmotion.models.unseen_depth.annotation_prior import AnnotationPrior
     from probmotion.motion.skeleton import Skeleton
 
@@ -46,7 +46,7 @@ def locomotion_prior() -> SpectralMixtureMotion:
 
     Motions have 10 frames at 10 fps and 12 azimuths.
     """
-    from probmotion.models.spectral.spectral_mixture import SpectralMixtureMotion
+    from probmotion.models.mixture.spectral_mixture import SpectralMixtureMotion
 
     prior = SpectralMixtureMotion.load("cmu-motion")
     fastest = np.argsort(-np.linalg.norm(prior.velocities, axis=1), kind="stable")[:_COMPONENTS]
@@ -82,7 +82,7 @@ def pose_prior(
     ground : float
         Standard deviation of the centroid's ground position, metres.
     """
-    from probmotion.models.spectral.spectral_mixture import SpectralMixtureMotion
+    from probmotion.models.mixture.spectral_mixture import SpectralMixtureMotion
 
     K, J, _ = learnt.means.shape
     along = np.zeros((3 * J, 2))

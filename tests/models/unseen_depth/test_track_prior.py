@@ -13,8 +13,8 @@ from probmotion.arrays import logsumexp
 from probmotion.data.projections import DetectorNoise, Filming
 from probmotion.data.synthetic.walks import synthetic_walks
 from probmotion.data.tracks.learning import film_clips
-from probmotion.models.spectral import SpectralMixtureMotion
-from probmotion.models.spectral.spectrum import bands, to_frequencies
+from probmotion.models.mixture import SpectralMixtureMotion
+from probmotion.models.mixture.spectrum import bands, to_frequencies
 from probmotion.models.unseen_depth import motion_prior_from_tracks
 from probmotion.models.unseen_depth.track_em import expectation, maximisation, moments
 

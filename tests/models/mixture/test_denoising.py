@@ -7,8 +7,8 @@ import pytest
 
 from probmotion.data.joint_filters import kalman_smooth
 from probmotion.data.synthetic.walks import synthetic_walks
-from probmotion.models.spectral.denoising import denoise_joints
-from probmotion.models.spectral.spectral_mixture import SpectralMixtureMotion
+from probmotion.models.mixture.denoising import denoise_joints
+from probmotion.models.mixture.spectral_mixture import SpectralMixtureMotion
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.likelihoods import Joints3D
 from probmotion.problems.denoising import gaussian_noise

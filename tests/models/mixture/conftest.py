@@ -8,7 +8,7 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
 from probmotion import Cameras, Joints3D, Keypoints2D, Motion, Skeleton
-from probmotion.models.spectral import SpectralMixtureMotion
+from probmotion.models.mixture import SpectralMixtureMotion
 
 BODY = Skeleton(["hips", "head", "left_hand", "right_hand"], [-1, 0, 0, 0])
 L, J = 5, 4

@@ -8,9 +8,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from probmotion.arrays import Array, logsumexp
-from probmotion.models.mixture.posterior import natural_parameters
-from probmotion.models.mixture.rotated_mixture import rotation_coefficients, rotation_fields
-from probmotion.models.spectral.conditioning import (
+from probmotion.models.mixture.conditioning import (
     Component,
     Components,
     Conditional,
@@ -18,6 +16,8 @@ from probmotion.models.spectral.conditioning import (
     rotation,
     turned,
 )
+from probmotion.models.mixture.posterior import natural_parameters
+from probmotion.models.mixture.rotated_mixture import rotation_coefficients, rotation_fields
 from probmotion.posteriors.protocols import Likelihood
 
 __all__ = ["SpectralPosterior", "condition", "draw"]

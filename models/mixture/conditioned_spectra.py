@@ -12,7 +12,7 @@ import numpy as np
 
 from probmotion.arrays import Array
 from probmotion.geometry.cameras import Cameras
-from probmotion.models.spectral.posterior import SpectralPosterior, condition
+from probmotion.models.mixture.spectral_posterior import SpectralPosterior, condition
 from probmotion.posteriors.protocols import Likelihood, MotionPrior, NotConjugate
 from probmotion.validation import check_shape
 

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from probmotion import seeds
+from probmotion.arrays import logsumexp
 from probmotion.models.bodies.body_states import turned_about_vertical
+from probmotion.models.mixture.conditioning import turned
 from probmotion.models.mixture.fit import cut_windows
-from probmotion.models.spectral.conditioning import turned
-from probmotion.models.spectral.rotated_spectra import RotatedSpectra
-from probmotion.models.spectral.spectrum import (
+from probmotion.models.mixture.spectrum import (
     bands,
     principal_directions,
     ramp,
@@ -27,7 +27,7 @@ from probmotion.validation import check_count
 
 __all__ = ["fit_components"]
 
-_NUMBERS = (1, 4, 8, 16, 24, 32)  # of components to choose from
+_NUMBERS = (1, 4, 8, 16, 32)  # of components to choose from
 _SHRINKAGES = (5.0, 20.0, 80.0)  # windows' worth of the moments of all windows
 _FOLDS = 3
 _GLOBAL_WEIGHT = 0.05  # of the component of all windows
@@ -143,6 +143,8 @@ def _component(moments: Moments) -> dict[str, np.ndarray]:
     share = np.where(np.arange(L) == 0, *_INDEPENDENT)[:, None, None]
     covariances = moments.bands * (1 - share + share * np.eye(P))
     directions, variances = principal_directions(covariances, bands(L))
+    # Windows are centred: the prior sets the variance of the ground position by ``ground``.
+    variances[0, :2] = 1.0
     return {
         "poses": moments.pose.reshape(-1, 3),
         "velocities": moments.velocity,
@@ -247,21 +249,18 @@ def _chosen(
 
 def _log_density(fitted: dict[str, Any], coefficients: np.ndarray, fps: float) -> np.ndarray:
     """Return log densities of canonical windows (n, L, P) at heading 0, (n,)."""
-    n, L, P = coefficients.shape
-    means = [
-        _mean(pose.reshape(-1), velocity, L, fps)
-        for pose, velocity in zip(fitted["poses"], fitted["velocities"], strict=True)
-    ]
-    log_weights = np.log(fitted["weights"])[:, None] + np.log(fitted["scale_weights"])
-    spectra = fitted["variances"][:, None] * fitted["scales"][:, None, None]
-    mixture = RotatedSpectra(
-        fitted["directions"],
-        bands(L),
-        np.stack(means),
-        spectra,
-        log_weights,
-        np.zeros(1),
-    )
-    fields = coefficients.reshape(n, L, P // 3, 3)
-    # Blocks of windows whose products fit into a cache.
-    return np.concatenate([mixture.log_density(fields[i : i + 16]) for i in range(0, n, 16)])
+    L, P = coefficients.shape[1:]
+    terms = []
+    parts = ("poses", "velocities", "directions", "variances", "weights")
+    for pose, velocity, directions, variances, weight in zip(
+        *(fitted[name] for name in parts), strict=True
+    ):
+        deviation = coefficients - _mean(pose.reshape(-1), velocity, L, fps)
+        scores = np.matmul(deviation.swapaxes(0, 1), directions[fitted["band"]])  # (L, n, P)
+        square = np.einsum("fnp,fp->n", scores**2, 1 / variances)
+        log_det = np.log(variances).sum()
+        for scale, scale_weight in zip(fitted["scales"], fitted["scale_weights"], strict=True):
+            log_norm = log_det + L * P * math.log(2 * math.pi * scale)
+            terms.append(math.log(weight * scale_weight) - 0.5 * (square / scale + log_norm))
+    values: np.ndarray = logsumexp(np.stack(terms, axis=-1))
+    return values

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from probmotion.models.spectral.conditioning import Components, rotation
-from probmotion.models.spectral.rotated_spectra import blocks
-from probmotion.models.spectral.spectrum import to_frequencies
+from probmotion.models.mixture.conditioning import Components, rotation
+from probmotion.models.mixture.rotated_spectra import blocks
+from probmotion.models.mixture.spectrum import to_frequencies
 
 __all__ = ["ViewSpectra"]
 

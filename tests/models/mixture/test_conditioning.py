@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from probmotion.models.spectral.conditioning import Conditional, Information
+from probmotion.models.mixture.conditioning import Conditional, Information
 
 
 def information_matrices(kind):

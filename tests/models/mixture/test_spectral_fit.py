@@ -1,13 +1,16 @@
 """Fitting: recovery of known priors, headings, number of components, degenerate clips."""
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from probmotion import Motion, Skeleton
 from probmotion.data.synthetic.gaits import make_gaits
 from probmotion.data.synthetic.walks import synthetic_walks
-from probmotion.models.spectral import SpectralMixtureMotion
-from probmotion.models.spectral.spectrum import ramp
+from probmotion.models.mixture import SpectralMixtureMotion, spectral_fit
+from probmotion.models.mixture.spectrum import ramp, to_frequencies
 
 TURNS = np.random.default_rng(9).uniform(0, 2 * np.pi, 400)
 
@@ -158,3 +161,18 @@ def test_invalid_clips_are_rejected():
             SpectralMixtureMotion.fit(motions, **{"frames": 10, "progress": False} | options)
     with pytest.raises(ValueError, match="finite"):
         SpectralMixtureMotion.fit([Motion(broken, skeleton, 30.0)], 10, progress=False)
+
+
+def test_held_out_density_is_that_of_the_prior():
+    person = Skeleton.preset("person14")
+    clips = [clip.retarget(person) for clip in synthetic_walks(3, person, seconds=2.0)]
+    prior = SpectralMixtureMotion.fit(clips, 8, components=3, azimuths=1, progress=False)
+    # The fit takes a variance of 1 for the coefficient of the ground position.
+    ground = 1 / math.sqrt(person.n_joints * 8)
+    one = replace(prior, scales=np.ones(1), scale_weights=np.ones(1), ground=ground)
+    windows = one.sample(np.random.default_rng(0), 5)
+    coefficients = to_frequencies(windows.reshape(5, 8, -1), axis=1)
+    names = ("poses", "velocities", "directions", "band", "variances", "weights")
+    fitted = {name: getattr(one, name) for name in (*names, "scales", "scale_weights")}
+    density = spectral_fit._log_density(fitted, coefficients, one.fps)
+    np.testing.assert_allclose(density, one.log_prior(windows), rtol=1e-9)

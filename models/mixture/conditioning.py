@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from probmotion.models.spectral.spectrum import from_frequencies, to_frequencies
+from probmotion.models.mixture.spectrum import from_frequencies, to_frequencies
 
 __all__ = ["Component", "Components", "Conditional", "Information", "rotation", "turned"]
 

@@ -25,19 +25,19 @@ import numpy as np
 from probmotion.arrays import Array, array_namespace, constant
 from probmotion.files import written_whole
 from probmotion.geometry.cameras import Cameras
-from probmotion.models.spectral.conditioned_spectra import ConditionedSpectra
-from probmotion.models.spectral.conditioning import Component, Components
-from probmotion.models.spectral.fit import fit_components
-from probmotion.models.spectral.posterior import SpectralPosterior
-from probmotion.models.spectral.rotated_spectra import RotatedSpectra
-from probmotion.models.spectral.spectrum import (
+from probmotion.models.mixture.conditioned_spectra import ConditionedSpectra
+from probmotion.models.mixture.conditioning import Component, Components
+from probmotion.models.mixture.rotated_spectra import RotatedSpectra
+from probmotion.models.mixture.spectral_fit import fit_components
+from probmotion.models.mixture.spectral_posterior import SpectralPosterior
+from probmotion.models.mixture.spectrum import (
     from_frequencies,
     ramp,
     resampled,
     to_frequencies,
     translations,
 )
-from probmotion.models.spectral.view_spectra import ViewSpectra
+from probmotion.models.mixture.view_spectra import ViewSpectra
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.protocols import Likelihood

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from probmotion.models.spectral.spectrum import (
+from probmotion.models.mixture.spectrum import (
     bands,
     from_frequencies,
     ramp,

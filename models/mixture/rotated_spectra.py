@@ -178,13 +178,9 @@ class RotatedSpectra:
 
     def log_evidence(self, y: np.ndarray, variance: float) -> np.ndarray:
         """Return log p(k, s, a, y) up to a constant: ``(n, L, J, 3) → (n, K, S, A)``."""
-        out = np.empty((len(y), *self.shape))
         precision = 1 / (self._spectra + variance)
-        log_det = np.log(precision).sum(axis=-1)
-        for rows, block in blocks(y):
-            bases = [self._bases(block, k, shifted=True) for k in range(self.shape[0])]
-            out[rows] = self._logits(bases, precision, log_det)[: rows.stop - rows.start]
-        return out
+        bases = [self._bases(y, k, shifted=True) for k in range(self.shape[0])]
+        return self._logits(bases, precision, np.log(precision).sum(axis=-1))
 
     def _logits(
         self, bases: list[np.ndarray], precision: np.ndarray, log_det: np.ndarray

@@ -9,7 +9,7 @@ import pytest
 
 from probmotion import Cameras, MotionPosterior
 from probmotion.data.synthetic.walks import synthetic_walks
-from probmotion.models.spectral import SpectralMixtureMotion
+from probmotion.models.mixture import SpectralMixtureMotion
 from probmotion.posteriors import protocols
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
 from probmotion import seeds
-from probmotion.models.spectral.posterior import SpectralPosterior, condition, draw
-from probmotion.models.spectral.spectral_mixture import SpectralMixtureMotion
+from probmotion.models.mixture.spectral_mixture import SpectralMixtureMotion
+from probmotion.models.mixture.spectral_posterior import SpectralPosterior, condition, draw
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.likelihoods import Joints3D
 from probmotion.posteriors.sampling import progress_bar
@@ -22,7 +23,8 @@ _JOIN_NOISE = 1e-3  # standard deviation of these frames, metres
 _NOISES = np.geomspace(0.0025, 0.16, 7)  # candidates for unknown noise, metres
 _SWEEPS = 5  # of expectation maximisation for Student-t noise
 _NEGLIGIBLE = 1e-6  # probability of components that a draw's continuation leaves out
-_SCREENED = 40.0  # nats below the most likely component, at which others are left out
+_KEPT = 0.999  # total probability of the components of a window
+_SCREENED = 25.0  # nats below the most likely component, at which others are left out
 _OUTLIER_WEIGHT = 0.5  # below it an observation has a precision of its own
 
 
@@ -104,11 +106,16 @@ def denoise_joints(
     weight = finite.astype(float) if confidence is None else np.where(finite, confidence, 0.0)
     if not weight.any():
         raise ValueError("joints must contain an observed joint, got none")
-    prior = _prior_of(skeleton) if prior is None else prior
-    if prior.skeleton != skeleton:
-        raise ValueError("skeleton must be the prior's; retarget the recording to it")
     length = min(len(joints), max(round(_SECONDS * fps), 2))
-    local = prior.resampled(length, fps)
+    if prior is None:
+        local = _shipped(skeleton, length, fps)
+    elif prior.skeleton == skeleton:
+        local = prior.resampled(length, fps)
+    else:
+        raise ValueError(
+            f"skeleton must be the prior's, {prior.skeleton.n_joints} joints, got one of "
+            f"{skeleton.n_joints}; retarget the recording to it"
+        )
     starts = _starts(len(joints), length)
     recording = _Recording(np.where(weight[..., None] > 0, joints, 0.0), weight, local, length)
     if noise is None:
@@ -148,10 +155,19 @@ class _Recording:
     ) -> SpectralPosterior:
         """Return the posterior of a window, about its origin."""
         likelihood = self.likelihood(start, noise)
-        posterior = self._given(likelihood, self._probable(likelihood))
+        posterior = self._posterior(likelihood)
         if degrees_of_freedom is not None:
             posterior = self._without_outliers(likelihood, posterior, degrees_of_freedom)
         return posterior
+
+    def _posterior(self, likelihood: Joints3D) -> SpectralPosterior:
+        """Return the posterior under the most probable components."""
+        chosen = self._probable(likelihood)
+        probability = self._given(likelihood, chosen).component_probabilities.sum(axis=1)
+        order = np.argsort(-probability, kind="stable")
+        before = np.cumsum(probability[order]) - probability[order]
+        # Covariances with gaps are costly: keep the fewest components of this total probability.
+        return self._given(likelihood, np.sort(chosen[order[before < _KEPT]]))
 
     def _given(self, likelihood: Joints3D, chosen: np.ndarray) -> SpectralPosterior:
         """Return the posterior under some of the prior's components."""
@@ -162,10 +178,12 @@ class _Recording:
     def _probable(self, likelihood: Joints3D) -> np.ndarray:
         """Return the components that may matter, given observations with their gaps filled.
 
-        Gaps are filled with the posterior mean of the first component. Without gaps, frequencies
-        are independent, and the evidence of all components takes less time than one with gaps.
+        Gaps and outliers are filled with the posterior mean of the first component. Without gaps,
+        frequencies are independent, and the evidence of all components takes less time than one
+        with gaps.
         """
-        seen = likelihood.entries.visible
+        confidence = likelihood.entries.confidence
+        seen = confidence > _OUTLIER_WEIGHT * confidence.max()
         joints = likelihood.joints
         if not seen.all():
             first = self._given(likelihood, np.array([len(self.prior.scales) // 2]))
@@ -191,14 +209,15 @@ class _Recording:
             if ordinary.any():
                 expected[ordinary] = expected[ordinary].mean()
             new = replace(likelihood, confidence=weight * expected)
-            posterior = self._given(new, self._probable(new))
+            posterior = self._posterior(new)
         return posterior
 
 
-def _prior_of(skeleton: Skeleton) -> SpectralMixtureMotion:
-    """Return the shipped prior of a skeleton."""
+@lru_cache(maxsize=4)
+def _shipped(skeleton: Skeleton, frames: int, fps: float) -> SpectralMixtureMotion:
+    """Return the shipped prior of a skeleton for windows; cached per process."""
     if skeleton == Skeleton.preset("person14"):
-        return SpectralMixtureMotion.load("cmu-motion")
+        return SpectralMixtureMotion.load("cmu-motion").resampled(frames, fps)
     raise ValueError(
         f"skeleton must be person14, got one of {skeleton.n_joints} joints; retarget the "
         "recording, or give a prior fitted to clips of this skeleton"

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2, chisquare, norm
 
 from probmotion import Joints3D, Keypoints2D
-from probmotion.models.spectral.posterior import condition, draw
+from probmotion.models.mixture.spectral_posterior import condition, draw
 from probmotion.posteriors.protocols import NotConjugate
 
 

@@ -1,3 +1,0 @@
-from .conditioned_spectra import ConditionedSpectra as ConditionedSpectra
-from .posterior import SpectralPosterior as SpectralPosterior
-from .spectral_mixture import SpectralMixtureMotion as SpectralMixtureMotion
