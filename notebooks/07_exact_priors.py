@@ -49,8 +49,9 @@ print(f"{len(prior.weights)} components at {len(prior.scales)} scales, {prior.fr
 # %% [markdown]
 # ## 1. Draws of the prior
 #
-# Draws are independent and take no iterations. They move as people do, but nothing prevents a bone from changing its
-# length: a Gaussian knows only means and covariances.
+# Draws are independent and take no iterations, but they are distorted people: bones differ in length, and bodies
+# float or lean. A Gaussian knows only means and covariances. It is a prior to *infer* with, from observations that fix
+# what it does not know; for generation, see tutorial 3.
 
 # %%
 started = time.perf_counter()
@@ -107,11 +108,14 @@ pd.Series(row).round(2).to_frame(clip.name or "walk")
 # The draws continue the motion of hidden joints in different ways; their spread is the uncertainty.
 
 # %%
-elbow = prior.skeleton.index("right_wrist")
+wrist = prior.skeleton.index("right_wrist")
 times = np.arange(clip.frames) / clip.fps
+hidden = times[limb_occlusions(clip)[:, wrist]]
 fig, ax = plt.subplots(figsize=(7, 3))
-ax.plot(times, found.draws[:, :, elbow, 1].T, color="tab:orange", alpha=0.4, linewidth=0.8)
-ax.plot(times, clip.positions[:, elbow, 1], color="black", label="truth")
+ax.axvspan(hidden[0], hidden[-1], color="0.92", label="hidden")
+lines = ax.plot(times, found.draws[:, :, wrist, 1].T, color="tab:orange", alpha=0.5, linewidth=0.8)
+lines[0].set_label("20 draws")
+ax.plot(times, clip.positions[:, wrist, 1], color="black", label="truth")
 ax.set(xlabel="time (s)", ylabel="height of the right wrist (m)")
 ax.legend(frameon=False)
 fig.tight_layout()
@@ -119,8 +123,8 @@ fig.tight_layout()
 # %% [markdown]
 # ## 3. Where it fails
 #
-# The shipped prior was learnt without soccer and without getting up from the back. On those the intervals of hidden
-# joints are too narrow, and the gain over a Kalman smoother, which knows nothing about bodies, shrinks or is lost.
+# The shipped prior was learnt without soccer and without getting up from the back. In these two recordings, it finds
+# hidden joints no better than a Kalman smoother, which knows nothing about bodies: their errors are large.
 
 # %%
 data = Path(os.environ.get("PROBMOTION_DATA", "../shared/data"))

@@ -60,6 +60,8 @@ def test_invalid_numbers_are_refused():
 def test_a_missing_package_names_its_extra(monkeypatch):
     assert import_extra("numpy.linalg", "arrays") is np.linalg
     monkeypatch.setitem(sys.modules, "blackjax", None)
+    # A module that another test has imported would be found without its package.
+    monkeypatch.delitem(sys.modules, "blackjax.mcmc", raising=False)
     message = r"blackjax must be installed, got .*; run pip install 'probmotion\[kernels\]'"
     with pytest.raises(ModuleNotFoundError, match=message):
         import_extra("blackjax.mcmc", "kernels")

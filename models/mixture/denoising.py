@@ -64,7 +64,7 @@ def denoise_joints(
     """Return the posterior of a recording of noisy joints with gaps.
 
     The recording is cut into windows of two seconds that overlap by half; the posterior of each is
-    exact under the components that are not far less likely than others. Means and variances are
+    exact under the most probable components (together 99.9 %). Means and variances are
     averaged between windows with weights that fall linearly to 0 at a window's ends. Each draw
     continues from the draw of the previous window.
 
