@@ -90,7 +90,7 @@ def learnt(base, teacher, tmp_path_factory):
     with torch.no_grad():
         initial_loss = trainee.validation_loss(trainee.network.eval(), CPU)
     folder = tmp_path_factory.mktemp("vae")
-    settings = replace(usual_motion_vae_training("tiny")[1], steps=180, checkpoint_every=180)
+    settings = replace(usual_motion_vae_training("tiny")[1], steps=220, checkpoint_every=220)
     result = train(trainee, settings, folder, progress=False)
     return trainee, initial_loss, result, MotionVAE.load(folder)
 
