@@ -35,6 +35,7 @@ from probmotion.models.training.standardisation import Standards
 from probmotion.motion.skeleton import Skeleton
 from probmotion.problems import load_problem
 from probmotion.samplers import MultiViewAncestral
+from probmotion.samplers.diffusion.noise_levels import Cosine
 
 FRAMES, JOINTS, VIEWS = 180, 16, 5
 
@@ -156,7 +157,9 @@ def strided(draws: int = 256) -> dict[str, float]:
     reference = problem.generation.of_learnt()
     fid, seconds = {}, {}
     for steps in (20, 100):
-        sampler = MultiViewAncestral(steps=steps, trained_steps=100, perspective=True)
+        sampler = MultiViewAncestral(
+            steps=steps, levels=Cosine(trained_steps=100), perspective=True
+        )
         start = time.perf_counter()
         motions = sampler.sample(problem.posterior, draws=draws, progress=False).flat()
         seconds[steps] = time.perf_counter() - start

@@ -23,17 +23,18 @@ from probmotion.threads import one_thread
 
 WEIGHTS = Path(__file__).parents[1] / "models" / "weights"
 HELD_OUT_ACTION = "soccer"
-COMPONENTS = 40  # of each source, chosen on validation clips
+COMPONENTS = (60, 20)  # of the two sources, chosen on left-out training and validation clips
 
 CARD = """# cmu-motion
 
 Spectral mixture of human motion on `person14`, at 30 frames per second
-({components} components, half of them from each source, at three scales, 24 headings): exact density, denoisers and posterior.
+({components} components, {counts[0]} of the first source and {counts[1]} of the second, at three scales, 24 headings): exact density, denoisers and posterior.
 
 - **Data**: {minutes:.1f} minutes: the training clips of the denoising study (of
   CMU subjects 01, 02, 131 and of DeepMimic, `probmotion.data.denoising_clips`) and the clips of
-  CMU's walking, running, jumping, basketball, referee signals and directing traffic. Validation
-  and test clips of the study are held out, and the action soccer as a whole.
+  CMU's walking, running, jumping, basketball, referee signals and directing traffic; and the
+  mirror images of all clips. Validation and test clips of the study are held out, and the action
+  soccer as a whole.
 - **Provenance**: cmu_*, walk_*, …: mocap.cs.cmu.edu, free for research and commercial use; the
   database was created with funding from NSF EIA-0196217. humanoid3d_*: xbpeng/DeepMimic, MIT
   licence, © 2018 Xue Bin Peng.
@@ -71,8 +72,8 @@ def main() -> None:
     # The two sources place joints differently on the body, so that moments are not pooled.
     with one_thread():
         priors = [
-            SpectralMixtureMotion.fit(part, components=COMPONENTS)
-            for part in (clips["train"], kept)
+            SpectralMixtureMotion.fit([*part, *map(mirrored, part)], components=count)
+            for part, count in zip((clips["train"], kept), COMPONENTS, strict=True)
         ]
     prior = joined(priors)
     seconds = time.perf_counter() - start
@@ -83,10 +84,20 @@ def main() -> None:
     card = {"minutes": round(minutes, 1), "held out": HELD_OUT_ACTION, "command": "ship_cmu_motion"}
     replace(prior, card=card).save(WEIGHTS / "cmu-motion.npz")
     text = CARD.format(
-        components=len(prior.weights), minutes=minutes, rows="\n".join(rows), seconds=seconds
+        components=len(prior.weights),
+        counts=COMPONENTS,
+        minutes=minutes,
+        rows="\n".join(rows),
+        seconds=seconds,
     )
     (WEIGHTS / "cmu-motion.md").write_text(text, encoding="utf-8")
     print(text)
+
+
+def mirrored(motion: Motion) -> Motion:
+    """Return the motion with left and right exchanged."""
+    order = list(motion.skeleton.mirrored_order)
+    return replace(motion, positions=motion.positions[:, order] * [-1.0, 1.0, 1.0])
 
 
 def joined(priors: Sequence[SpectralMixtureMotion]) -> SpectralMixtureMotion:

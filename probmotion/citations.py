@@ -9,6 +9,14 @@ __all__ = ["CITATIONS", "OF_SETTINGS", "POSE_PAIRS", "citations_of"]
 _OURS = "The probmotion authors. probmotion: one posterior over 3D skeletal motion, many samplers."
 _DDPM = "Ho, Jain, Abbeel (2020). Denoising diffusion probabilistic models. NeurIPS."
 _COSINE = "Nichol, Dhariwal (2021). Improved denoising diffusion probabilistic models. ICML."
+_KARRAS = (
+    "Karras, Aittala, Aila, Laine (2022). Elucidating the design space of diffusion-based "
+    "generative models. NeurIPS."
+)
+_SOLVER = (
+    "Lu, Zhou, Bao, Chen, Li, Zhu (2022). DPM-Solver++: fast solver for guided sampling of "
+    "diffusion probabilistic models. arXiv:2211.01095."
+)
 _MAS = (
     "Kapon, Tevet, Cohen-Or, Bermano (2024). MAS: multi-view ancestral sampling for 3D motion "
     "generation using 2D diffusion. CVPR."
@@ -19,12 +27,22 @@ CITATIONS: Mapping[str, tuple[str, ...]] = {
         "Tipping, Bishop (1999). Mixtures of probabilistic principal component analysers. Neural "
         "Computation 11.",
     ),
-    "ancestral3d": (_DDPM, _COSINE),
+    "ancestral3d": (_DDPM, _SOLVER, _KARRAS),
     "mas": (_MAS, _DDPM, _COSINE),
     "mvpc": (
         _MAS,
         "Song et al. (2021). Score-based generative modeling through stochastic differential "
         "equations. ICLR.",
+        _SOLVER,
+        _KARRAS,
+    ),
+    "split-gibbs": (
+        "Vono, Dobigeon, Chainais (2019). Split-and-augmented Gibbs sampler: application to "
+        "large-scale inference problems. IEEE Trans. Signal Processing 67.",
+        "Wu, Sun, Chen, Zhang, Yue, Bouman (2024). Principled probabilistic imaging using "
+        "diffusion models as plug-and-play priors. NeurIPS.",
+        _SOLVER,
+        _KARRAS,
     ),
     "sds": (
         "Poole, Jain, Barron, Mildenhall (2023). DreamFusion: text-to-3D using 2D diffusion. ICLR.",

@@ -1,3 +1,4 @@
+from .conditional.split_gibbs import SplitGibbs as SplitGibbs
 from .diffusion.ancestral3d import Ancestral3D as Ancestral3D
 from .diffusion.mas import MultiViewAncestral as MultiViewAncestral
 from .diffusion.mvpc import MultiViewPredictorCorrector as MultiViewPredictorCorrector

@@ -128,6 +128,11 @@ class MotionDiffusion(TrackNetwork):
         """Metres per normalised unit."""
         return self.standards.scale
 
+    @property
+    def view_elevation(self) -> float:
+        """Elevation of the views in which the prior denoises, radians; that of MAS."""
+        return math.pi / 16
+
     def motion(self, theta: Array) -> Array:
         """Return the joint positions in θ: ``(…, dim) → (…, L, J, 3)``, metres."""
         check_shape("theta", theta, ("…", self.dim))

@@ -108,7 +108,10 @@ class DiffusionSettings(TransformerSettings):
     def level(self, alpha_bar: float) -> float:
         """Return the fractional index of the noise level ᾱ, interpolated in log noise.
 
-        Beyond the last level the index is T, since the signal there is below a thousandth.
+        Raises
+        ------
+        ValueError
+            If ᾱ is not in (0, 1] or below the last level of training.
         """
         if not 0 < alpha_bar <= 1:
             raise ValueError(f"alpha_bar must be above 0 and at most 1, got {alpha_bar:.3g}")
@@ -116,5 +119,11 @@ class DiffusionSettings(TransformerSettings):
         # Level 0 has no noise; use a hundredth of the first level's to avoid log 0.
         noise = np.sqrt((1 - levels) / levels)
         noise[0] = 0.01 * noise[1]
+        if alpha_bar < levels[-1] * (1 - 1e-9):
+            raise ValueError(
+                f"noise levels must be at most {noise[-1]:.3g}, the network's last, got "
+                f"{math.sqrt((1 - alpha_bar) / alpha_bar):.3g}; use levels="
+                f"Cosine(trained_steps={self.steps}) or Karras()"
+            )
         here = max(math.sqrt((1 - alpha_bar) / alpha_bar), noise[0])
         return float(np.interp(math.log(here), np.log(noise), np.arange(len(levels))))

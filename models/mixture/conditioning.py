@@ -14,6 +14,7 @@ t' is Q(t − t') + Q(t + t' + 1), where Q is the inverse Fourier transform of K
 from __future__ import annotations
 
 import math
+from collections import Counter
 from functools import cached_property
 from typing import NamedTuple
 
@@ -77,12 +78,10 @@ class Information(NamedTuple):
     @classmethod
     def of(cls, information: np.ndarray) -> Information:
         """Split information matrices (L, J, 3, 3)."""
-        distinct, inverse, counts = np.unique(
-            information.reshape(-1, 9), axis=0, return_inverse=True, return_counts=True
-        )
-        common = distinct[counts.argmax()].reshape(3, 3)
-        other = inverse.reshape(information.shape[:2]) != counts.argmax()
-        frames, joints = np.nonzero(other)
+        matrices = np.ascontiguousarray(information.reshape(-1, 9))
+        keys = matrices.view("V72").ravel().tolist()  # bytes, which are fast to count
+        common = matrices[keys.index(Counter(keys).most_common(1)[0][0])].reshape(3, 3)
+        frames, joints = np.nonzero((information != common).any(axis=(2, 3)))
         return cls(information, common, frames, joints, information[frames, joints] - common)
 
     @property
@@ -102,18 +101,13 @@ class Conditional:
     """Covariance P = (C⁻¹ + Λ)⁻¹ of one component given the information Λ, in canonical frame."""
 
     def __init__(self, component: Component, information: Information) -> None:
-        self._component = component
         self.information = information
-        self._kernel, self._log_det = _common_conditional(component, information.common)
-        frames, joints, excess = information.frames, information.joints, information.excess
-        H = len(frames)
+        self._root, self._log_det = _common_root(component, information.common)
+        H = len(information.frames)
         if H:
-            used, position = np.unique(joints, return_inverse=True)
-            G = self._between(used, (frames, position), (frames, position))
             # G Δ, block by block.
-            blocks = G.reshape(3 * H, H, 3, 1)
-            parts = (blocks[:, :, i] * excess[:, i] for i in range(3))
-            matrix = sum(parts, np.zeros(())).reshape(3 * H, 3 * H)
+            blocks = self._between_exceptions() @ information.excess
+            matrix = blocks.swapaxes(1, 2).reshape(3 * H, 3 * H)
             matrix[np.diag_indices(3 * H)] += 1.0
             self._factors = scipy.linalg.lu_factor(matrix, check_finite=False)
             self._log_det += float(np.log(np.abs(np.diag(self._factors[0]))).sum())
@@ -133,9 +127,8 @@ class Conditional:
                 self._factors, seen.reshape(len(out), -1).T, check_finite=False
             ).T.reshape(seen.shape)
             field = np.zeros_like(out)
-            field[:, self.information.frames, self.information.joints] = np.einsum(
-                "hij,nhj->nhi", self.information.excess, inner
-            )
+            products = (self.information.excess @ inner[..., None])[..., 0]
+            field[:, self.information.frames, self.information.joints] = products
             out -= self._common(field)
         return out
 
@@ -156,48 +149,63 @@ class Conditional:
     @cached_property
     def marginals(self) -> np.ndarray:
         """Covariance matrices of all entries, (L, J, 3, 3)."""
-        L, J, _ = self._component.mean.shape
-        joints = np.arange(J)
-        blocks = self._kernel.reshape(L, J, 3, J, 3)[:, joints, :, joints].swapaxes(0, 1)
-        transform = _lags(blocks)
+        L, P, _ = self._root.shape
+        J, H = P // 3, len(self.information.frames)
+        root = self._root.reshape(L, J, 3, P)
+        transform = _lags(root @ root.swapaxes(2, 3))
         # Q(2t + 1) for t < L, with period 2 L.
         out = transform[0] + transform[2 * np.arange(L) + 1]
-        frames, joints, excess = (
-            self.information.frames,
-            self.information.joints,
-            self.information.excess,
-        )
-        if len(frames):
-            every = np.divmod(np.arange(L * J), J)
-            cross = self._between(np.arange(J), every, (frames, joints))  # (3 L J, 3 H)
-            inner = scipy.linalg.lu_solve(self._factors, cross.T, check_finite=False)
-            inner = np.einsum("hij,hjx->hix", excess, inner.reshape(len(excess), 3, -1))
-            left = cross.reshape(L * J, 3, -1)
-            right = inner.reshape(-1, L * J, 3).swapaxes(0, 1)
-            out = out - (left @ right).reshape(out.shape)
+        if H:
+            delta = np.zeros((H, 3, H, 3))
+            delta[np.arange(H), :, np.arange(H)] = self.information.excess
+            Z = scipy.linalg.lu_solve(
+                self._factors, delta.reshape(3 * H, 3 * H), trans=1, check_finite=False
+            )
+            # Z is symmetric, T + Tᵀ with a triangular T, which halves the cost of the product.
+            Z[np.diag_indices(3 * H)] *= 0.5
+            cross = self._to_exceptions()
+            product = scipy.linalg.blas.dtrmm(1.0, Z, cross, side=1, lower=1, trans_a=1)
+            left, right = (part.reshape(L * J, 3, 3 * H) for part in (product, cross))
+            half = left @ right.swapaxes(1, 2)
+            out -= (half + half.swapaxes(1, 2)).reshape(out.shape)
         return out
 
     def _common(self, shift: np.ndarray) -> np.ndarray:
         """Return P₀ η."""
         n, L = shift.shape[:2]
-        spectrum = to_frequencies(shift.reshape(n, L, -1), axis=1)
-        product = np.matmul(spectrum.swapaxes(0, 1), self._kernel).swapaxes(0, 1)
-        return from_frequencies(product, axis=1).reshape(shift.shape)
+        spectrum = to_frequencies(shift.reshape(n, L, -1), axis=1).swapaxes(0, 1)
+        product = (spectrum @ self._root) @ self._root.swapaxes(1, 2)
+        return from_frequencies(product.swapaxes(0, 1), axis=1).reshape(shift.shape)
 
-    def _between(
-        self,
-        used: np.ndarray,
-        rows: tuple[np.ndarray, np.ndarray],
-        columns: tuple[np.ndarray, np.ndarray],
-    ) -> np.ndarray:
-        """Return P₀ between entries, given by their frames and indices into the joints ``used``."""
-        L, P, _ = self._kernel.shape
-        kernel = self._kernel.reshape(L, P // 3, 3, P // 3, 3)[:, used][:, :, :, used]
-        transform = np.ascontiguousarray(_lags(kernel).swapaxes(2, 3))  # (2 L, j, j', 3, 3)
-        (t, i), (u, j) = rows, columns
-        out = transform[np.abs(t[:, None] - u), i[:, None], j]
-        out += transform[(t[:, None] + u + 1) % len(transform), i[:, None], j]
-        return out.swapaxes(1, 2).reshape(3 * len(t), 3 * len(u))
+    def _between_exceptions(self) -> np.ndarray:
+        """Return G, (H, H, 3, 3)."""
+        L, P, _ = self._root.shape
+        t, joints = self.information.frames, self.information.joints
+        used = np.unique(joints)
+        j = np.searchsorted(used, joints)
+        root = self._root.reshape(L, P // 3, 3, P)[:, used].reshape(L, -1, P)
+        transform = _lags(root @ root.swapaxes(1, 2)).reshape(2 * L, len(used), 3, len(used), 3)
+        blocks = np.ascontiguousarray(transform.swapaxes(2, 3)).reshape(-1, 9)
+        pairs = len(used) * j[:, None] + j
+        near, far = np.abs(t[:, None] - t), (t[:, None] + t + 1) % (2 * L)
+        G = blocks.take(len(used) ** 2 * near + pairs, axis=0)
+        G += blocks.take(len(used) ** 2 * far + pairs, axis=0)
+        return G.reshape(len(t), len(t), 3, 3)
+
+    def _to_exceptions(self) -> np.ndarray:
+        """Return P₀ between all entries and the exceptions, (3 L J, 3 H), in Fortran order."""
+        L, P, _ = self._root.shape
+        frames, joints = self.information.frames, self.information.joints
+        used = np.unique(joints)
+        root = self._root.reshape(L, P // 3, 3, P)[:, used].reshape(L, -1, P)
+        transform = _lags(root @ self._root.swapaxes(1, 2))
+        transform = np.ascontiguousarray(transform.swapaxes(0, 1))  # (3 used, 2 L, P)
+        earlier = np.roll(transform, L, axis=1)  # from τ = −L on
+        out = np.empty((len(frames), 3, L, P))
+        for row, t, j in zip(out, frames, np.searchsorted(used, joints), strict=True):
+            own = slice(3 * j, 3 * j + 3)
+            np.add(earlier[own, L - t : 2 * L - t], transform[own, t + 1 : t + 1 + L], out=row)
+        return out.reshape(3 * len(frames), L * P).T
 
 
 def turned(field: np.ndarray, azimuth: float) -> np.ndarray:
@@ -211,13 +219,12 @@ def rotation(azimuth: float) -> np.ndarray:
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
 
-def _common_conditional(component: Component, information: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return K_f, (L, P, P), and log det(I + C Λ₀), for the same Λ₀ at all entries."""
+def _common_root(component: Component, information: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return W with K_f = W Wᵀ, (L, P, P), and log det(I + C Λ₀), for the same Λ₀ everywhere."""
     V, variances = component.directions[component.band], component.variances
-    transposed = V.swapaxes(1, 2)
     if (information == information[0, 0] * np.eye(3)).all():
         ratio = 1 + information[0, 0] * variances
-        return (V * (variances / ratio)[:, None, :]) @ transposed, float(np.log(ratio).sum())
+        return V * np.sqrt(variances / ratio)[:, None, :], float(np.log(ratio).sum())
     # K = (I/λ + VᵀΛV)⁻¹ in the directions, as the square of a triangular root, since a difference
     # of covariances would lose digits where the noise is small.
     L, P, _ = V.shape
@@ -228,7 +235,7 @@ def _common_conditional(component: Component, information: np.ndarray) -> tuple[
     lower = np.linalg.cholesky(matrix)
     half = np.linalg.solve(lower, scaled.swapaxes(1, 2))
     diagonal = np.diagonal(lower, axis1=1, axis2=2)
-    return half.swapaxes(1, 2) @ half, 2 * float(np.log(diagonal).sum())
+    return half.swapaxes(1, 2), 2 * float(np.log(diagonal).sum())
 
 
 def _lags(kernel: np.ndarray) -> np.ndarray:

@@ -163,11 +163,13 @@ class _Recording:
     def _posterior(self, likelihood: Joints3D) -> SpectralPosterior:
         """Return the posterior under the most probable components."""
         chosen = self._probable(likelihood)
-        probability = self._given(likelihood, chosen).component_probabilities.sum(axis=1)
+        posterior = self._given(likelihood, chosen)
+        probability = posterior.component_probabilities.sum(axis=1)
         order = np.argsort(-probability, kind="stable")
         before = np.cumsum(probability[order]) - probability[order]
         # Covariances with gaps are costly: keep the fewest components of this total probability.
-        return self._given(likelihood, np.sort(chosen[order[before < _KEPT]]))
+        kept = np.sort(chosen[order[before < _KEPT]])
+        return posterior if len(kept) == len(chosen) else self._given(likelihood, kept)
 
     def _given(self, likelihood: Joints3D, chosen: np.ndarray) -> SpectralPosterior:
         """Return the posterior under some of the prior's components."""

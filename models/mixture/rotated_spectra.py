@@ -5,7 +5,9 @@ z_fp ~ N(0, λ_{k,s,f,p}) for frequency f and direction p. The noise is isotropi
 everything decouples in the coordinates V_kᵀ R(ψ_a)ᵀ y. These are trigonometric combinations of
 three base products (cos ψ, −sin ψ, 1; see :mod:`~probmotion.models.mixture.rotated_mixture`).
 Squared distances of all azimuths therefore follow from one 3×3 Gram matrix, and sums over azimuths
-from a 3×3 matrix of weights: the cost does not depend on the number of azimuths.
+from a 3×3 matrix of weights: the cost does not depend on the number of azimuths. Means are
+
+    E[X | y, k, s, a] = y − v R(ψ_a) V_k (λ + v)⁻¹ V_kᵀ (R(ψ_a)ᵀ y − m_k).
 """
 
 from __future__ import annotations
@@ -13,10 +15,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from probmotion.arrays import Array, array_namespace, constant, logsumexp
+from probmotion.models.mixture._spectral_kernels import (
+    combine,
+    cross_products,
+    from_bases,
+    to_bases,
+)
 from probmotion.models.mixture.rotated_mixture import rotation_coefficients
 
 __all__ = ["RotatedSpectra", "blocks"]
@@ -26,6 +35,18 @@ _BLOCK = 16
 rounding of a point must not depend on the batch size."""
 _NEGLIGIBLE = 1e-16  # responsibilities below are set to 0
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # entries of a symmetric 3×3 matrix
+
+
+class _Level(NamedTuple):
+    """Quantities that depend only on the variance v of the noise.
+
+    ``precision`` 1/(λ + v), (K, S, L, P); ``offsets``, (K, S): log of each component's density of
+    y at its mean, up to a constant.
+    """
+
+    variance: float
+    precision: np.ndarray
+    offsets: np.ndarray
 
 
 class RotatedSpectra:
@@ -59,183 +80,180 @@ class RotatedSpectra:
         K, S, L, P = spectra.shape
         self.shape = (K, S, len(azimuths))
         self.frames, self.n_joints = L, P // 3
-        scores = (means[:, :, None] @ directions[:, band])[:, :, 0]
-        self._means = scores.reshape(K, L * P)
-        self._spectra = spectra.reshape(K, S, L * P)
+        self._means = (means[:, :, None] @ directions[:, band])[:, :, 0]
+        self._spectra = spectra
         self._log_weights = log_weights - math.log(len(azimuths))
         # Rows of the x and z coordinates, and of the y coordinates.
         parts = (directions[:, :, 0::3], directions[:, :, 2::3])
         self._ground = np.concatenate(parts, axis=2)
         self._height = np.ascontiguousarray(directions[:, :, 1::3])
-        edges = np.flatnonzero(np.diff(band, prepend=-1, append=-1))
+        self._transposed = tuple(
+            np.ascontiguousarray(part.swapaxes(2, 3)) for part in (self._ground, self._height)
+        )
+        self._edges = np.flatnonzero(np.diff(band, prepend=-1, append=-1))
         self._bands = [
-            (int(band[start]), slice(start, stop)) for start, stop in pairwise(edges.tolist())
+            (int(band[start]), int(start), int(stop)) for start, stop in pairwise(self._edges)
         ]
-        self._to_world = rotation_coefficients(azimuths)  # (A, 3)
-        self._to_canonical = self._to_world * [1.0, -1.0, 1.0]
-        # Quadratic forms in (cos ψ, −sin ψ, 1) as products with their six distinct coefficients.
+        to_world = rotation_coefficients(azimuths)  # (A, 3)
+        to_canonical = to_world * [1.0, -1.0, 1.0]
+        # Quadratic forms in (cos ψ, −sin ψ, 1) as products with their coefficients.
         self._squares = np.stack(
-            [
-                self._to_canonical[:, i] * self._to_canonical[:, j] * (1 if i == j else 2)
-                for i, j in _PAIRS
-            ]
-        )  # (6, A)
-        both = self._to_world[:, :, None] * self._to_canonical[:, None, :]
+            [to_canonical[:, i] * to_canonical[:, j] for i in range(3) for j in range(3)]
+        )  # (9, A)
+        both = to_world[:, :, None] * to_canonical[:, None, :]
         self._both = both.reshape(len(azimuths), 9)
+        self._last: _Level | None = None
 
     def denoise(self, y: np.ndarray, variance: float) -> np.ndarray:
-        """Return E[X | y]: ``(n, L, J, 3) → (n, L, J, 3)``, v > 0."""
+        """Return E[X | y]: ``(n, L, J, 3) → (n, L, J, 3)``."""
+        level = self._level(variance)
         out = np.empty_like(y)
-        precision = 1 / (self._spectra + variance)
-        gain = self._spectra * precision
-        log_det = np.log(precision).sum(axis=-1)
+        bases = self._space()
         for rows, block in blocks(y):
-            bases = [self._bases(block, k, shifted=True) for k in range(self.shape[0])]
-            weights = self._responsibilities(bases, precision, log_det)
-            out[rows] = self._mean(bases, gain, self._sums(weights))[: rows.stop - rows.start]
+            self._bases(block, self._means, bases)
+            weights = self._responsibilities(bases, level)
+            mean = block - variance * self._weighted(bases, level.precision, weights)
+            out[rows] = mean[: rows.stop - rows.start]
         return out
 
     def covariance_product(self, y: np.ndarray, variance: float, vectors: np.ndarray) -> np.ndarray:
-        """Return Cov[X | y] u for each row: arrays (n, L, J, 3), v > 0."""
+        """Return Cov[X | y] u for each row: arrays (n, L, J, 3)."""
+        level = self._level(variance)
         out = np.empty_like(vectors)
-        K, S, _ = self.shape
-        precision = 1 / (self._spectra + variance)
-        gain = self._spectra * precision
-        log_det = np.log(precision).sum(axis=-1)
+        bases, turned = self._space(), self._space()
+        no_means, own = np.zeros_like(self._means), self._spectra * level.precision
         for (rows, block), (_, directions) in zip(blocks(y), blocks(vectors), strict=True):
-            bases = [self._bases(block, k, shifted=True) for k in range(K)]
-            weights = self._responsibilities(bases, precision, log_det)
-            turned = [self._bases(directions, k, shifted=False) for k in range(K)]
-            # Products of each component's mean with the vectors, from 3×3 cross-Gram matrices.
-            products = np.empty_like(weights)
-            for k in range(K):
-                for s in range(S):
-                    means = gain[k, s] * bases[k]
-                    means[2] += self._means[k]
-                    cross = np.einsum("inp,jnp->nij", means, turned[k], optimize=True)
-                    products[:, k, s] = np.einsum(
-                        "ai,nij,aj->na", self._to_canonical, cross, self._to_canonical
-                    )
+            self._bases(block, self._means, bases)
+            weights = self._responsibilities(bases, level)
+            self._bases(directions, no_means, turned)
+            # Products of (y − E[X | y, k, s, a]) / v with the vectors, from 3×3 matrices.
+            products = self._products(bases, turned, level.precision)
             centred = products - (weights * products).sum(axis=(1, 2, 3), keepdims=True)
-            total = self._mean(bases, gain, self._sums(weights * centred))
-            # The components' own covariances, v λ / (λ + v) in each direction.
-            own = self._mean(turned, variance * gain, self._sums(weights), means=False)
-            out[rows] = (total + own)[: rows.stop - rows.start]
+            between = self._weighted(bases, level.precision, weights * centred)
+            # A component's own covariance is v λ / (λ + v) in each direction.
+            within = self._weighted(turned, own, weights)
+            total = variance**2 * between + variance * within
+            out[rows] = total[: rows.stop - rows.start]
         return out
 
     def responsibilities(self, x: np.ndarray) -> np.ndarray:
         """Return p(k, s, a | X): ``(n, L, J, 3) → (n, K, S, A)``."""
         out = np.empty((len(x), *self.shape))
-        precision = 1 / self._spectra
-        log_det = np.log(precision).sum(axis=-1)
+        level, bases = self._level(0.0), self._space()
         for rows, block in blocks(x):
-            bases = [self._bases(block, k, shifted=True) for k in range(self.shape[0])]
-            weights = self._responsibilities(bases, precision, log_det)
+            weights = self._responsibilities(self._bases(block, self._means, bases), level)
             out[rows] = weights[: rows.stop - rows.start]
         return out
+
+    def log_evidence(self, y: np.ndarray, variance: float) -> np.ndarray:
+        """Return log p(k, s, a, y) up to a constant: ``(n, L, J, 3) → (n, K, S, A)``."""
+        bases = self._bases(y, self._means, self._space(len(y)))
+        return self._logits(bases, self._level(variance))
 
     def log_density(self, x: Array) -> Array:
         """Return log p(X): ``(n, L, J, 3) → (n,)``; NumPy, torch or JAX."""
         xp = array_namespace(x)
-        precision = 1 / self._spectra
-        K, n = self.shape[0], x.shape[0]
+        K, S, _ = self.shape
+        n = x.shape[0]
+        precision = 1 / self._spectra.reshape(K, S, -1)
         ground = xp.concat([x[..., 0], x[..., 2]], axis=-1)
         turned = xp.concat([x[..., 2], -x[..., 0]], axis=-1)
         products = []
-        for b, rows in self._bands:
+        for b, start, stop in self._bands:
             V, H = constant(self._ground[:, None, b], x), constant(self._height[:, None, b], x)
+            rows = slice(start, stop)
             products.append((ground[:, rows] @ V, turned[:, rows] @ V, x[:, rows, :, 1] @ H))
         bases = [
             xp.reshape(xp.concat(parts, axis=2), (K, n, -1))
             for parts in zip(*products, strict=True)
         ]
-        bases[2] = bases[2] - constant(self._means[:, None], x)
+        bases[2] = bases[2] - constant(self._means.reshape(K, 1, -1), x)
         weight = constant(np.swapaxes(precision, 1, 2), x)
         gram = xp.stack([(bases[i] * bases[j]) @ weight for i, j in _PAIRS], axis=-1)
-        squares = gram @ constant(self._squares, x)  # (K, n, S, A)
+        double = [self._squares[3 * i + j] * (1 if i == j else 2) for i, j in _PAIRS]
+        squares = gram @ constant(np.stack(double), x)  # (K, n, S, A)
         offset = self._log_weights + 0.5 * np.log(precision).sum(axis=-1)
         logits = constant(offset, x)[:, None, :, None] - 0.5 * squares
         values = logsumexp(xp.reshape(xp.permute_dims(logits, (1, 0, 2, 3)), (n, -1)))
-        return values - 0.5 * self._means.shape[1] * math.log(2 * math.pi)
+        return values - 0.5 * self._means[0].size * math.log(2 * math.pi)
 
-    def _bases(self, y: np.ndarray, k: int, *, shifted: bool) -> np.ndarray:
-        """Return V_kᵀ E_i y for the three base rotations E_i, (3, n, L P).
+    def _level(self, variance: float) -> _Level:
+        """Return the quantities of a noise level; the last one is kept."""
+        level = self._last
+        if level is None or level.variance != variance:
+            precision = 1 / (self._spectra + variance)
+            offsets = self._log_weights + 0.5 * np.log(precision).sum(axis=(2, 3))
+            level = self._last = _Level(variance, precision, offsets)
+        return level
 
-        With ``shifted``, the mean is subtracted from the third.
+    def _space(self, n: int = _BLOCK) -> np.ndarray:
+        """Return an array for the bases of n points; memory is slow at first use."""
+        return np.empty((self.shape[0], 3, n * self.frames, 3 * self.n_joints))
+
+    def _bases(self, y: np.ndarray, means: np.ndarray, out: np.ndarray) -> np.ndarray:
+        """Return V_kᵀ (E_i y − δ_i3 m_k) for the three base rotations E_i, (K, 3, n L, P).
+
+        Rows are ordered by band, then point, then frequency.
         """
-        n, L, J, _ = y.shape
-        out = np.empty((3, n, L, 3 * J))
-        x, z = y[..., 0], y[..., 2]
-        ground, turned = np.concatenate([x, z], axis=2), np.concatenate([z, -x], axis=2)
-        for b, rows in self._bands:
-            np.matmul(ground[:, rows], self._ground[k, b], out=out[0, :, rows])
-            np.matmul(turned[:, rows], self._ground[k, b], out=out[1, :, rows])
-            np.matmul(y[:, rows, :, 1], self._height[k, b], out=out[2, :, rows])
-        out = out.reshape(3, n, -1)
-        if shifted:
-            out[2] -= self._means[k]
+        ordered = y.reshape(-1, self.n_joints, 3)[self._order(len(y))]
+        x, height, z = (np.ascontiguousarray(ordered[..., i]) for i in range(3))
+        ground = np.stack([np.concatenate([x, z], axis=1), np.concatenate([z, -x], axis=1)])
+        for k, mean in enumerate(means):
+            to_bases(ground, height, self._ground[k], self._height[k], mean, self._edges, out[k])
         return out
 
-    def log_evidence(self, y: np.ndarray, variance: float) -> np.ndarray:
-        """Return log p(k, s, a, y) up to a constant: ``(n, L, J, 3) → (n, K, S, A)``."""
-        precision = 1 / (self._spectra + variance)
-        bases = [self._bases(y, k, shifted=True) for k in range(self.shape[0])]
-        return self._logits(bases, precision, np.log(precision).sum(axis=-1))
+    def _order(self, n: int) -> np.ndarray:
+        """Return the indices of n L frequencies by band, then point, then frequency."""
+        index = np.arange(n * self.frames).reshape(n, -1)
+        bands = pairwise(self._edges)
+        return np.concatenate([index[:, start:stop].ravel() for start, stop in bands])
 
-    def _logits(
-        self, bases: list[np.ndarray], precision: np.ndarray, log_det: np.ndarray
-    ) -> np.ndarray:
-        """Return log p(k, s, a, y), (n, K, S, A); ``log_det`` is that of the precision, (K, S)."""
-        K, S, A = self.shape
-        logits = np.empty((bases[0].shape[1], K, S, A))
+    def _products(self, left: np.ndarray, right: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Return Σ w l r at each azimuth, for weights w (K, S, L, P), (n, K, S, A)."""
+        K, S, _ = self.shape
+        out = np.empty((K, left.shape[2] // self.frames, S, 9))
         for k in range(K):
-            gram = np.stack([(bases[k][i] * bases[k][j]) @ precision[k].T for i, j in _PAIRS], -1)
-            logits[:, k] = gram @ self._squares  # (n, S, 6) @ (6, A)
+            cross_products(left[k], right[k], weights[k], self._edges, out[k])
+        products = out.swapaxes(0, 1).reshape(-1, K * S, 9) @ self._squares
+        return products.reshape(-1, *self.shape)
+
+    def _logits(self, bases: np.ndarray, level: _Level) -> np.ndarray:
+        """Return log p(k, s, a, y) up to a constant, (n, K, S, A)."""
+        logits = self._products(bases, bases, level.precision)
         logits *= -0.5
-        logits += (self._log_weights + 0.5 * log_det)[..., None]
+        logits += level.offsets[..., None]
         return logits
 
-    def _responsibilities(
-        self, bases: list[np.ndarray], precision: np.ndarray, log_det: np.ndarray
-    ) -> np.ndarray:
+    def _responsibilities(self, bases: np.ndarray, level: _Level) -> np.ndarray:
         """Return p(k, s, a | y), (n, K, S, A)."""
-        logits = self._logits(bases, precision, log_det)
-        logits -= logits.max(axis=(1, 2, 3), keepdims=True)
-        weights = np.exp(logits)
+        weights = self._logits(bases, level)
+        weights -= weights.max(axis=(1, 2, 3), keepdims=True)
+        np.exp(weights, out=weights)
         weights /= weights.sum(axis=(1, 2, 3), keepdims=True)
         weights[weights < _NEGLIGIBLE] = 0.0
         return weights
 
-    def _sums(self, weights: np.ndarray) -> np.ndarray:
-        """Return Σ_a w c_i(ψ_a) c_j(−ψ_a), (n, K, S, 3, 3), c = (cos, sin, 1)."""
-        sums = weights @ self._both
-        return sums.reshape(*sums.shape[:-1], 3, 3)
+    def _weighted(self, bases: np.ndarray, factors: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Return Σ_ksa w R(ψ_a) V_k f V_kᵀ R(ψ_a)ᵀ (y − R(ψ_a) m_k), (n, L, J, 3).
 
-    def _mean(
-        self, bases: list[np.ndarray], gain: np.ndarray, sums: np.ndarray, *, means: bool = True
-    ) -> np.ndarray:
-        """Return Σ_ksa w R(ψ_a)(m_k + V_k gain V_kᵀ R(ψ_a)ᵀ (y − R(ψ_a) m_k)), (n, L, J, 3)."""
-        K, S, _ = self.shape
-        L, J = self.frames, self.n_joints
-        n = bases[0].shape[1]
-        out = np.zeros((n, L, J, 3))
-        for k in range(K):
-            if not sums[:, k].any():
-                continue
-            combined = np.zeros((n, 3, L * 3 * J))
-            for s in range(S):
-                spread = np.swapaxes(gain[k, s] * bases[k], 0, 1)
-                combined += sums[:, k, s] @ spread
-            if means:
-                combined += sums[:, k].sum(axis=1)[:, :, 2, None] * self._means[k]
-            combined = combined.reshape(n, 3, L, 3 * J)
-            for b, rows in self._bands:
-                V, part = self._ground[k, b].T, combined[:, :, rows]
-                ground, turned = part[:, 0] @ V, part[:, 1] @ V
-                out[:, rows, :, 0] += ground[..., :J] + turned[..., J:]
-                out[:, rows, :, 2] += ground[..., J:] - turned[..., :J]
-                out[:, rows, :, 1] += part[:, 2] @ self._height[k, b].T
-        return out
+        Overwrites the bases of y − m.
+        """
+        n, L, J = len(weights), self.frames, self.n_joints
+        # Σ_a w c_i(ψ_a) c_j(−ψ_a) with c = (cos, sin, 1).
+        sums = weights.reshape(n, -1, weights.shape[3]) @ self._both
+        sums = sums.reshape(*weights.shape[:3], 3, 3)
+        ground, height = np.zeros((2, n * L, 2 * J)), np.zeros((n * L, J))
+        for k in range(self.shape[0]):
+            own = np.ascontiguousarray(sums[:, k])
+            if own.any():
+                combine(bases[k], factors[k], own, self._edges)
+                along, up = (part[k] for part in self._transposed)
+                from_bases(bases[k], along, up, self._edges, ground, height)
+        straight, turned = ground
+        x, z = straight[:, :J] + turned[:, J:], straight[:, J:] - turned[:, :J]
+        out = np.empty((n * L, J, 3))
+        out[self._order(n)] = np.stack([x, height, z], axis=-1)
+        return out.reshape(n, L, J, 3)
 
 
 def blocks(rows: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:

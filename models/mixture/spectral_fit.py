@@ -28,10 +28,10 @@ from probmotion.validation import check_count
 __all__ = ["fit_components"]
 
 _NUMBERS = (1, 4, 8, 16, 32)  # of components to choose from
-_SHRINKAGES = (5.0, 20.0, 80.0)  # windows' worth of the moments of all windows
+_SHRINKAGES = (2.5, 10.0, 40.0)  # windows' worth of the moments of all windows
 _FOLDS = 3
 _GLOBAL_WEIGHT = 0.05  # of the component of all windows
-_INDEPENDENT = (0.1, 0.02)
+_INDEPENDENT = (0.1, 0.003)
 """Weight of independent coordinates in covariances, at frequency 0 and at others: correlations of
 postures are estimated from few clips, and are too large for motion that is unlike them."""
 _FLOOR = 1e-8  # keeps activities of still windows finite, square metres

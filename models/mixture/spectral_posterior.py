@@ -23,6 +23,7 @@ from probmotion.posteriors.protocols import Likelihood
 __all__ = ["SpectralPosterior", "condition", "draw"]
 
 _NEGLIGIBLE = 1e-9  # probability of components without effect on moments
+_TINY = 1e-16  # probability of components without effect on means, relative to the largest
 
 
 def condition(
@@ -57,9 +58,11 @@ def condition(
         raised = np.maximum(top, log_terms.max(axis=1))
         old = np.exp(top - raised)
         weights = np.exp(log_terms - raised[:, None])
+        weights[weights < _TINY] = 0.0
         total = total * old + weights.sum(axis=1)
         mean *= old[:, None, None, None]
-        mean += means(weights)
+        if weights.any():
+            mean += means(weights)
         top = raised
     return log_joint, mean / total[:, None, None, None]
 
@@ -92,7 +95,7 @@ def draw(
         if not split.isotropic or c not in conditionals:
             conditionals = {c: Conditional(component, local)}
         conditional = conditionals[c]
-        pull = np.einsum("ljab,ljb->lja", local.all, component.mean)
+        pull = (local.all @ component.mean[..., None])[..., 0]
         centre = component.mean + conditional.solve(shift[rows] @ R - pull)
         out[rows] = (centre + conditional.draw(component.draw(scores[rows]), unit[rows])) @ R.T
     return out
@@ -106,6 +109,7 @@ def _conditioned(
         # P does not depend on the azimuth: three base fields of η give all azimuths.
         fields = rotation_fields(shift.reshape(len(shift), -1, 3)).swapaxes(0, 1)
         fields = fields.reshape(3, *shift.shape)
+        to_world = rotation_coefficients(components.yaws)
         to_canonical = rotation_coefficients(-components.yaws)
         for c, component in enumerate(components.gaussians):
             conditional = Conditional(component, information)
@@ -115,13 +119,13 @@ def _conditioned(
             def means(
                 weights: np.ndarray, component: Component = component, solved: np.ndarray = solved
             ) -> np.ndarray:
-                turns = rotation_coefficients(components.yaws)
-                sums = np.einsum("na,ai,aj->nij", weights, turns, to_canonical)
+                sums = (weights[:, None] * to_world.T) @ to_canonical  # (n, 3, 3)
                 solved[2] += component.mean
-                base = np.einsum("nij,jnltx->inltx", sums, solved, optimize=True)
-                rotated = rotation_fields(base.reshape(3, len(weights), -1, 3))
-                total: np.ndarray = rotated[0, :, 0] + rotated[1, :, 1] + rotated[2, :, 2]
-                return total.reshape(solved.shape[1:])
+                base = sums @ solved.reshape(3, len(weights), -1).swapaxes(0, 1)
+                straight, turned, fixed = base.swapaxes(0, 1).reshape(solved.shape)
+                x = straight[..., 0] + turned[..., 2]
+                z = straight[..., 2] - turned[..., 0]
+                return np.stack([x, fixed[..., 1], z], axis=-1)
 
             yield c, slice(None), log_terms, means
         return
@@ -165,13 +169,14 @@ def _solve(
         P η_i, the last with η − Λ m, so that Σ c_i P η_i = E[x] − m.
     """
     i, n = fields.shape[:2]
-    pull = np.einsum("ljab,ljb->lja", information.all, component.mean)
-    linear = np.einsum("inljx,ljx->ni", fields, component.mean, optimize=True)
+    pull = (information.all @ component.mean[..., None])[..., 0]
+    linear = (fields.reshape(i, n, -1) @ component.mean.ravel()).T
     shifted = fields.copy()
     shifted[-1] -= pull
     solved = conditional.solve(shifted.reshape(i * n, *fields.shape[2:])).reshape(fields.shape)
-    gram = np.einsum("inljx,knljx->nik", shifted, solved, optimize=True)
-    square = np.einsum("ai,nik,ak->na", coefficients, gram, coefficients, optimize=True)
+    left, right = (part.reshape(i, n, -1).swapaxes(0, 1) for part in (shifted, solved))
+    gram = left @ right.swapaxes(1, 2)
+    square = ((coefficients @ gram) * coefficients).sum(axis=2)
     constant = -0.5 * float((component.mean * pull).sum()) - 0.5 * conditional.log_determinant
     return linear @ coefficients.T + 0.5 * square + constant, solved
 
@@ -234,18 +239,24 @@ class SpectralPosterior:
         mean = self.mean()
         total = np.zeros((*mean.shape, 3))
         for c, component in enumerate(self.components.gaussians):
-            conditional = None
-            for a in np.flatnonzero(probabilities[c] > _NEGLIGIBLE).tolist():
-                R = rotation(self.components.yaws[a])
-                if not information.isotropic:
-                    conditional = Conditional(component, information.rotated(R))
-                elif conditional is None:
-                    conditional = Conditional(component, information)
-                pull = np.einsum("ljab,ljb->lja", conditional.information.all, component.mean)
-                centre = component.mean + conditional.solve((self.shift @ R - pull)[None])[0]
-                difference = centre @ R.T - mean
-                between = difference[..., :, None] * difference[..., None, :]
-                total += probabilities[c, a] * (R @ conditional.marginals @ R.T + between)
+            azimuths = np.flatnonzero(probabilities[c] > _NEGLIGIBLE)
+            # With isotropic information, azimuths have the same covariance.
+            for group in azimuths[None] if information.isotropic else azimuths[:, None]:
+                if len(group) == 0:
+                    continue
+                rotations = np.stack([rotation(self.components.yaws[a]) for a in group])
+                local = information if information.isotropic else information.rotated(rotations[0])
+                conditional = Conditional(component, local)
+                pull = (local.all @ component.mean[..., None])[..., 0]
+                turns = rotations[:, None]
+                solved = conditional.solve(self.shift @ turns - pull)
+                difference = (component.mean + solved) @ turns.swapaxes(2, 3) - mean
+                weights = probabilities[c, group]
+                across = np.moveaxis(difference, 0, -1)
+                total += (across * weights) @ across.swapaxes(2, 3)
+                # Σ_a w_a R_a M R_aᵀ as one product with all entries of each M.
+                turn = np.einsum("a,aij,akl->jlik", weights, rotations, rotations).reshape(9, 9)
+                total += (conditional.marginals.reshape(-1, 9) @ turn).reshape(total.shape)
         return total
 
     def sample(self, rng: np.random.Generator, n: int) -> np.ndarray:

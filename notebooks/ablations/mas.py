@@ -59,6 +59,7 @@ from probmotion.posteriors.sampling import Sampler
 from probmotion.problems import load_problem
 from probmotion.samplers import MultiViewAncestral, MultiViewPredictorCorrector, ScoreDistillation
 from probmotion.samplers.diffusion.ancestral2d import Ancestral2D
+from probmotion.samplers.diffusion.noise_levels import Cosine
 
 SEED = 0
 FPS = 20.0
@@ -407,7 +408,7 @@ def strided(study: Study) -> pd.DataFrame:
     real = study.motions("test")
     variants: dict[tuple[int, str], Sampler] = {}
     for steps in (10, 20, 50, 100):
-        fewer = {"steps": steps, "trained_steps": 100}
+        fewer = {"steps": steps, "levels": Cosine(trained_steps=100)}
         variants[steps, "MAS"] = MultiViewAncestral(**fewer, perspective=True)
         variants[steps, "mvpc"] = MultiViewPredictorCorrector(**fewer)
     labelled = {f"{name}, {steps} steps": sampler for (steps, name), sampler in variants.items()}

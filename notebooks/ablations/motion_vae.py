@@ -61,6 +61,7 @@ from probmotion.posteriors.problem import Problem
 from probmotion.posteriors.sampling import Sampler
 from probmotion.problems import load_problem
 from probmotion.samplers import ExactSampler, MultiViewAncestral, ScoreDistillation
+from probmotion.samplers.diffusion.noise_levels import Cosine
 
 FPS = 10.0
 FRAMES = 10
@@ -307,7 +308,11 @@ def generation(study: Study) -> pd.DataFrame:
         MotionPosterior(study.variant("final")) if study.quick else load_problem("walk-vae")
     )
     iterations = 50 if study.quick else 1000
-    mas = MultiViewAncestral(steps=10, trained_steps=100) if study.quick else MultiViewAncestral()
+    mas = (
+        MultiViewAncestral(steps=10, levels=Cosine(trained_steps=100))
+        if study.quick
+        else MultiViewAncestral()
+    )
     grids: tuple[tuple[str, Problem | MotionPosterior, dict[str, Sampler], int], ...] = (
         ("motion-vae", motion_vae, {"motion VAE": ExactSampler()}, n * per_motion),
         (

@@ -5,6 +5,7 @@ The part of a component is the difference of the samplers' error measures (T: st
 
 - ``remainder``: from exact draws to `ancestral3d` with 10 T steps; 0 if correctly implemented
 - ``discretisation``: from 10 T to T steps
+- ``integrator``: from the second-order integrator and levels of `ancestral3d` to those of `mas`
 - ``single view``: from the 3D denoiser to `mas` with exact 2D denoisers, both given observations
 - ``noise sharing``: from noise shared by all views to independent noise in each view
 - ``guidance``: from conditional to unconditional, guided denoising, if there are observations
@@ -38,8 +39,9 @@ __all__ = ["decompose_error"]
 
 _REFINEMENT = 10  # steps of the `remainder` sampler, as a multiple of T
 # Settings of `mas` that are compatible with the decomposition.
-_SETTINGS = ("n_views", "elevation", "view_weights", "schedule_power", "guidance", "batch")
-_COMMON_SETTINGS = ("schedule_power", "batch")  # also settings of `ancestral3d`
+_SETTINGS = (
+    "n_views", "elevation", "view_weights", "levels", "integrator", "guidance", "batch",
+)  # fmt: skip
 
 
 def decompose_error(
@@ -68,7 +70,8 @@ def decompose_error(
     draws : int
         Number of draws per sampler and seed, at least 10.
     settings : mapping, optional
-        Settings of `mas`: n_views, elevation, view_weights, schedule_power, guidance, batch.
+        Settings of `mas`: n_views, elevation, view_weights, levels, integrator,
+        guidance, batch.
     shared_noise : bool, optional
         Whether `mas` projects one 3D noise into all views, which removes the noise-sharing part.
         True by default if there are observations, because guidance requires it.
@@ -139,7 +142,7 @@ def _chain(
             raise ValueError(f"settings must be among {', '.join(_SETTINGS)}, got {name!r}")
     require_exact(problem)
     Ancestral, Mas = load_sampler("ancestral3d"), load_sampler("mas")
-    common = {name: settings[name] for name in _COMMON_SETTINGS if name in settings}
+    batch = {name: settings[name] for name in ("batch",) if name in settings}
     likelihood = problem.posterior.likelihood
     inside = conditioned(problem.posterior)
     shared = likelihood is not None if shared_noise is None else shared_noise
@@ -147,11 +150,14 @@ def _chain(
         raise ValueError(
             "shared_noise must be True with observations, because guidance requires it, got False"
         )
+    mas = Mas(steps=steps, **settings)
+    same = Ancestral(steps=steps, levels=mas.levels, integrator=mas.integrator, **batch)
     links = [
         _Link("exact", load_sampler("exact")(), problem.posterior),
-        _Link("remainder", Ancestral(steps=_REFINEMENT * steps, **common), inside),
-        _Link("discretisation", Ancestral(steps=steps, **common), inside),
-        _Link("single view", Mas(steps=steps, **settings), inside),
+        _Link("remainder", Ancestral(steps=_REFINEMENT * steps, **batch), inside),
+        _Link("discretisation", Ancestral(steps=steps, **batch), inside),
+        _Link("integrator", same, inside),
+        _Link("single view", mas, inside),
     ]
     notes = []
     last = links[-1].sampler

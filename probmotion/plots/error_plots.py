@@ -30,7 +30,8 @@ __all__ = ["draw_error_decomposition"]
 _FLOOR, _WHOLE = "floor", "whole"  # table rows of exact draws and of the sum of parts
 _COLOURS = {
     "remainder": "#7A7A7A",
-    "discretisation": CYCLE[2],
+    "discretisation": CYCLE[6],
+    "integrator": CYCLE[2],
     "single view": CYCLE[3],
     "noise sharing": CYCLE[4],
     "guidance": CYCLE[5],

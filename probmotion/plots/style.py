@@ -60,6 +60,7 @@ _SAMPLERS = {
     "ancestral3d": SamplerStyle("#664AA4", "p"),
     "mas": SamplerStyle("#A42D10", "D"),
     "mvpc": SamplerStyle("#0D99FD", "v"),
+    "split-gibbs": SamplerStyle("#5A000F", "h"),
     "sds": SamplerStyle("#E768AF", "X"),
     "mh": SamplerStyle("#3F244F", "<"),
     "nuts": SamplerStyle("#0747E3", "s"),

@@ -5,6 +5,7 @@ x_t = √ᾱ_t x₀ + √(1−ᾱ_t) ε with ε ~ N(0, I). Level 0 is clean; lev
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -73,6 +74,11 @@ class NoiseSchedule:
     def steps(self) -> int:
         """Number of steps T."""
         return len(self.alpha_bar) - 1
+
+    def sigma(self, t: int) -> float:
+        """Return the noise level σ = √((1−ᾱ)/ᾱ) at level t, in units of the signal."""
+        alpha_bar = float(self.alpha_bar[t])
+        return math.sqrt((1 - alpha_bar) / alpha_bar)
 
     def strided(self, steps: int) -> NoiseSchedule:
         """Return a schedule of ``steps`` steps with a subset of these levels."""

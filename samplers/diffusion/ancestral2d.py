@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
@@ -19,7 +19,10 @@ from probmotion.posteriors.sampling import (
     require,
     suited,
 )
-from probmotion.samplers.diffusion.ancestral import MotionState, NoiseLevels, ancestral
+from probmotion.samplers.diffusion.ancestral import ancestral
+from probmotion.samplers.diffusion.integrators import DDPM, AnyIntegrator
+from probmotion.samplers.diffusion.noise_levels import AnyLevels, Cosine, NoiseLevels
+from probmotion.samplers.diffusion.states import MotionState
 from probmotion.seeds import NormalStreams
 from probmotion.validation import check_count
 
@@ -28,7 +31,7 @@ __all__ = ["Ancestral2D"]
 
 @dataclass(frozen=True)
 class Ancestral2D(NoiseLevels):
-    """DDPM ancestral sampling of one view with a 2D denoiser, the upper bound in table 2 of MAS.
+    """Diffusion sampling of one view with a 2D denoiser, the upper bound in table 2 of MAS.
 
     Returns 2D motions and is therefore not a :class:`~probmotion.posteriors.sampling.Sampler`.
 
@@ -36,10 +39,10 @@ class Ancestral2D(NoiseLevels):
     ----------
     steps : int
         Number of denoising steps T.
-    trained_steps : int, optional
-        Number of levels of the schedule from which T are selected; ``steps`` by default.
-    schedule_power : int
-        Power of the cosine schedule: 2 in Nichol and Dhariwal (2021), 4 in the code of MAS.
+    levels : AnyLevels
+        Spacing of the noise levels.
+    integrator : AnyIntegrator
+        Integrator of the reverse diffusion.
     batch : int
         Maximum batch size; does not affect the draws.
     """
@@ -48,8 +51,8 @@ class Ancestral2D(NoiseLevels):
     requires: ClassVar[tuple[type, ...]] = (Denoises2D,)
 
     steps: int = 100
-    trained_steps: int | None = None
-    schedule_power: int = 2
+    levels: AnyLevels = field(default_factory=Cosine)
+    integrator: AnyIntegrator = field(default_factory=DDPM)
     batch: int = 256
 
     def sample_views(
@@ -104,14 +107,15 @@ class Ancestral2D(NoiseLevels):
         if view.n_views != 1:
             raise ValueError(f"camera must have one view, got {view.n_views}")
         shape = (posterior.frames, posterior.skeleton.n_joints, 2)
-        state = MotionState(_ViewDenoiser(prior, view), self.schedule, shape)
+        state = MotionState([_ViewDenoiser(prior, view)], self.schedule, shape)
         bars = progress_bar(self.steps * -(-draws // self.batch), self.name, progress)
         done: list[np.ndarray] = []
         # Rounding of multithreaded matrix products depends on the batch size.
         with threadpool_limits(1, user_api="blas"), bars as bar:
             for batch in batches([(0, draw) for draw in range(draws)], self.batch):
                 streams = NormalStreams.of_draws(seed, list(batch))
-                done.append(ancestral(state, streams, lambda: bar.update(1)) * prior.scale)
+                drawn = ancestral(state, streams, lambda: bar.update(1), self.integrator)
+                done.append(drawn * prior.scale)
         return np.concatenate(done)
 
 

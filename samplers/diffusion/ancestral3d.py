@@ -7,8 +7,11 @@ from typing import ClassVar
 
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.protocols import Denoises3D
-from probmotion.samplers.diffusion.ancestral import AncestralSampler, MotionState
+from probmotion.samplers.diffusion.ancestral import AncestralSampler
 from probmotion.samplers.diffusion.guidance import AnyGuidance, MomentMatched, guide_towards
+from probmotion.samplers.diffusion.integrators import AnyIntegrator, SecondOrderSDE
+from probmotion.samplers.diffusion.noise_levels import AnyLevels, LogSNR
+from probmotion.samplers.diffusion.states import MotionState
 from probmotion.samplers.diffusion.views import MotionDenoiser
 
 __all__ = ["Ancestral3D"]
@@ -16,19 +19,19 @@ __all__ = ["Ancestral3D"]
 
 @dataclass(frozen=True)
 class Ancestral3D(AncestralSampler):
-    """DDPM ancestral sampling (Ho et al. 2020, algorithm 2) with a 3D denoiser.
+    """Diffusion sampling with a 3D denoiser.
 
-    With the same number of steps, draws of ``mas`` differ from those of this sampler by the error
-    due to conditioning on single views.
+    With the same steps, levels and integrator, draws of ``mas`` differ from those of this sampler
+    by the error due to conditioning on single views.
 
     Parameters
     ----------
     steps : int
         Number of denoising steps T.
-    trained_steps : int, optional
-        Number of levels of the schedule from which T are selected; ``steps`` by default.
-    schedule_power : int
-        Power of the cosine schedule: 2 in Nichol and Dhariwal (2021), 4 in the code of MAS.
+    levels : AnyLevels
+        Spacing of the noise levels.
+    integrator : AnyIntegrator
+        Integrator of the reverse diffusion.
     guidance : AnyGuidance
         Method of conditioning on the observations.
     batch : int
@@ -38,9 +41,9 @@ class Ancestral3D(AncestralSampler):
     name: ClassVar[str] = "ancestral3d"
     requires: ClassVar[tuple[type, ...]] = (Denoises3D,)
 
-    steps: int = 100
-    trained_steps: int | None = None
-    schedule_power: int = 2
+    steps: int = 50
+    levels: AnyLevels = field(default_factory=LogSNR)
+    integrator: AnyIntegrator = field(default_factory=SecondOrderSDE)
     guidance: AnyGuidance = field(default_factory=MomentMatched)
     batch: int = 256
 
@@ -49,4 +52,4 @@ class Ancestral3D(AncestralSampler):
         denoiser = MotionDenoiser(posterior.prior)
         shape = (posterior.frames, posterior.skeleton.n_joints, 3)
         guide = guide_towards(self, posterior, self.guidance, denoiser)
-        return MotionState(denoiser, self.schedule, shape, guide)
+        return MotionState([denoiser], self.schedule, shape, [guide])

@@ -113,31 +113,43 @@ class MomentMatched:
 
     def prepare(self, observations: LinearObservations, denoiser: StateDenoiser) -> Guide:
         """Return the guide for one run."""
-        root = np.sqrt(observations.precision)[..., None]
 
         def guide(
             x_t: np.ndarray, alpha_bar: float, clean: np.ndarray, step: PosteriorStep
         ) -> np.ndarray:
-            def spread(entries: np.ndarray) -> np.ndarray:
-                """Return C Aᵀ W^½ u."""
-                adjoint = observations.adjoint(root * entries)
-                return denoiser.covariance_product(x_t, alpha_bar, adjoint)
-
-            def whiten(motions: np.ndarray) -> np.ndarray:
-                """Return W^½ A X."""
-                return root * observations.observe(motions)
-
-            residual = root * (observations.target - observations.observe(clean))
-            # Weight both sides by W^½, because W⁻¹ does not exist for missing entries.
-            guided = clean + conjugate_gradients(spread, whiten, residual, self.steps)
-            if not np.isfinite(guided).all():
-                raise ValueError(
-                    f"guidance with steps={self.steps} diverged at alpha_bar={alpha_bar:.3g}, "
-                    "because the denoiser's Jacobian is not symmetric; use fewer steps"
-                )
-            return guided
+            return self.condition(observations, denoiser, x_t, alpha_bar, clean)[0]
 
         return guide
+
+    def condition(
+        self,
+        observations: LinearObservations,
+        denoiser: StateDenoiser,
+        x_t: np.ndarray,
+        alpha_bar: float,
+        clean: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the conditional mean and (y − A D)ᵀ (A C Aᵀ + W⁻¹)⁻¹ (y − A D), (B,)."""
+        root = np.sqrt(observations.precision)[..., None]
+
+        def spread(entries: np.ndarray) -> np.ndarray:
+            """Return C Aᵀ W^½ u."""
+            adjoint = observations.adjoint(root * entries)
+            return denoiser.covariance_product(x_t, alpha_bar, adjoint)
+
+        def whiten(motions: np.ndarray) -> np.ndarray:
+            """Return W^½ A X."""
+            return root * observations.observe(motions)
+
+        residual = root * (observations.target - observations.observe(clean))
+        # Weight both sides by W^½, because W⁻¹ does not exist for missing entries.
+        change = conjugate_gradients(spread, whiten, residual, self.steps)
+        if not np.isfinite(change).all():
+            raise ValueError(
+                f"guidance with steps={self.steps} diverged at alpha_bar={alpha_bar:.3g}, "
+                "because the denoiser's Jacobian is not symmetric; use fewer steps"
+            )
+        return clean + change, _products(residual, residual - whiten(change))
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,12 @@ from probmotion.geometry.cameras import Cameras
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.protocols import Denoises2D
 from probmotion.posteriors.sampling import UnsupportedPosterior, require
-from probmotion.samplers.diffusion.ancestral import AncestralSampler, MotionState, State, ancestral
+from probmotion.samplers.diffusion.ancestral import AncestralSampler, ancestral
 from probmotion.samplers.diffusion.guidance import AnyGuidance, MomentMatched, guide_towards
+from probmotion.samplers.diffusion.integrators import DDPM, AnyIntegrator, Transition
+from probmotion.samplers.diffusion.noise_levels import AnyLevels, Cosine
 from probmotion.samplers.diffusion.separate_views import SeparateViews
+from probmotion.samplers.diffusion.states import MotionState, State
 from probmotion.samplers.diffusion.views import MultiViewDenoiser, Views, views_around
 from probmotion.seeds import NormalStreams
 from probmotion.validation import check_count, check_positive, check_shape
@@ -50,15 +53,12 @@ class MultiViewAncestral(AncestralSampler):
         Project one 3D noise array to all views instead of drawing independent noise per view.
     view_weights : tuple of float, optional
         Weights of the views in the triangulation; 1 by default.
-    trained_steps : int, optional
-        Number of levels of the schedule from which T are selected; ``steps`` by default.
-    schedule_power : int
-        Power of the cosine schedule: 2 as published, 4 in the authors' code.
+    levels : AnyLevels
+        Spacing of the noise levels: cosine with power 2 as published, 4 in the authors' code.
+    integrator : AnyIntegrator
+        Integrator of the reverse diffusion: DDPM as published.
     stop_level : int
         Last noise level, whose estimate is returned; 2 in the authors' code.
-    variance_for_deviation : bool
-        Multiply the noise by the variance of the DDPM posterior, as printed in line 8 of
-        algorithm 1, instead of its standard deviation.
     guidance : AnyGuidance
         Method of conditioning on the observations.
     batch : int
@@ -80,10 +80,9 @@ class MultiViewAncestral(AncestralSampler):
     distance: float = 7.0
     shared_noise: bool = True
     view_weights: tuple[float, ...] | None = None
-    trained_steps: int | None = None
-    schedule_power: int = 2
+    levels: AnyLevels = field(default_factory=Cosine)
+    integrator: AnyIntegrator = field(default_factory=DDPM)
     stop_level: int = 1
-    variance_for_deviation: bool = False
     guidance: AnyGuidance = field(default_factory=MomentMatched)
     batch: int = 256
 
@@ -107,7 +106,7 @@ class MultiViewAncestral(AncestralSampler):
 
         The early-stopped optimiser in its triangulation is not reproduced.
         """
-        return cls(n_views=7, perspective=True, schedule_power=4, stop_level=2)
+        return cls(n_views=7, perspective=True, levels=Cosine(power=4), stop_level=2)
 
     @property
     def cameras(self) -> Cameras:
@@ -122,19 +121,25 @@ class MultiViewAncestral(AncestralSampler):
         if not self.shared_noise:
             raise ValueError("shared_noise must be True to compute new views, got False")
         state = self._state(posterior)
-        watched: list[Any] = []
+        steps: list[Transition] = []
+        noises: list[np.ndarray] = []
+
+        def watch(step: Transition | None, noise: np.ndarray) -> None:
+            if step is not None:
+                steps.append(step)
+            noises.append(noise)
+
         streams = NormalStreams.of_draws(seed, [(0, draw) for draw in range(draws)])
-        options = {"watch": lambda *pair: watched.append(pair), **self._options()}
-        ancestral(state, streams, lambda: None, **options)
-        estimates = np.stack([clean for clean, _ in watched[1:]])
-        noises = np.stack([noise for _, noise in watched[:-1]])
-        if noises.shape[-1] == 2:
-            noises = np.stack([Views(self.cameras).combine(noise) for noise in noises])
+        result = ancestral(
+            state, streams, lambda: None, self.integrator, watch=watch, **self._options()
+        )
+        if noises[0].shape[-1] == 2:
+            noises = [Views(self.cameras).combine(noise) for noise in noises]
         scale = posterior.prior.scale  # type: ignore[attr-defined]
-        return MultiViewTrace(self, estimates, noises, scale)
+        return MultiViewTrace(self, tuple(steps), np.stack(noises), result, scale)
 
     def _options(self) -> dict[str, Any]:
-        return {"stop": self.stop_level, "variance_for_deviation": self.variance_for_deviation}
+        return {"stop": self.stop_level}
 
     def _state(self, posterior: MotionPosterior) -> State:
         prior = posterior.prior
@@ -144,7 +149,7 @@ class MultiViewAncestral(AncestralSampler):
         if self.shared_noise and not self.perspective:
             denoiser = MultiViewDenoiser(prior, views)
             guide = guide_towards(self, posterior, self.guidance, denoiser)
-            return MotionState(denoiser, self.schedule, shape, guide)
+            return MotionState([denoiser], self.schedule, shape, [guide])
         if posterior.likelihood is not None:
             raise UnsupportedPosterior(
                 self.name,
@@ -163,17 +168,20 @@ class MultiViewTrace:
     ----------
     sampler : MultiViewAncestral
         Settings of the run.
-    estimates : ndarray, (T − stop_level + 1, B, L, J, 3)
-        X⁽ⁱ⁾: triangulated estimates at levels T to stop_level, in normalised units.
+    steps : tuple of Transition, (T − stop_level,)
+        Steps from level T to stop_level; estimates are triangulated, in normalised units.
     noises : ndarray, (T − stop_level + 1, B, L, J, 3)
-        ε₃D⁽ⁱ⁾: initial noise, then the noise added after each estimate except the last.
+        ε₃D⁽ⁱ⁾: initial noise, then the noise added after each step.
+    result : ndarray, (B, L, J, 3)
+        Motions, the estimates at stop_level, in normalised units.
     scale : float
         Metres per normalised unit.
     """
 
     sampler: MultiViewAncestral
-    estimates: np.ndarray
+    steps: tuple[Transition, ...]
     noises: np.ndarray
+    result: np.ndarray
     scale: float
 
     def replay(self, cameras: Cameras, level: int = 0) -> np.ndarray:
@@ -202,14 +210,12 @@ class MultiViewTrace:
                 f"level must be 0 or between {sampler.stop_level} and {schedule.steps}, got {level}"
             )
         if level == 0:
-            return self._project(cameras, self.estimates[-1])
+            return self._project(cameras, self.result)
         views = Views(cameras)
         x = views.project(self.noises[0])
-        for i, t in enumerate(range(schedule.steps, level, -1)):
-            step = schedule.posterior(t)
-            power = 2 if sampler.variance_for_deviation else 1
-            noise = step.deviation**power * views.project(self.noises[i + 1])
-            x = step.clean * self._project(cameras, self.estimates[i]) + step.noisy * x + noise
+        for step, noise in zip(self.steps[: schedule.steps - level], self.noises[1:], strict=False):
+            clean = step.clean * self._project(cameras, step.combined)
+            x = clean + step.noisy * x + step.deviation * views.project(noise)
         return x
 
     def _project(self, cameras: Cameras, motions: np.ndarray) -> np.ndarray:

@@ -1,10 +1,12 @@
 """Multi-view predictor-corrector sampling.
 
 MAS averages the estimates of single views, so the state is off-manifold if views favour different
-modes. Langevin steps with step size ε at high noise levels make the views consistent:
+modes. Langevin steps with step size ε at high noise levels make the views consistent, and views of
+exact denoisers, which alternate between levels, cover the sphere
+(:func:`~probmotion.samplers.diffusion.views.view_sets`):
 
     D(X, t) = M⁻¹ Σ_v P_vᵀ E[x₀ | P_v X, t],   M = Σ_v P_vᵀ P_v,   Λ = V M⁻¹,   σ = √((1−ᾱ)/ᾱ)
-    predictor  X ← DDPM posterior step with D(X, t), noise ~ N(0, Λ^γ(σ))
+    predictor  X ← step of the integrator with D(X, t), noise ~ N(0, Λ^γ(σ))
     corrector  X ← X + ε (√ᾱ D(X) − X) + √(2ε(1−ᾱ)) ξ,   ξ ~ N(0, Λ^γ(σ))
 
 √ᾱ D(X) − X = (1−ᾱ) M⁻¹ ∇ Σ_v log p_v(P_v X), so for γ = 1 the corrector is Langevin dynamics
@@ -25,14 +27,12 @@ import numpy as np
 
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.protocols import Denoises2D
-from probmotion.samplers.diffusion.ancestral import AncestralSampler, MotionState, State, sigma
+from probmotion.samplers.diffusion.ancestral import AncestralSampler
 from probmotion.samplers.diffusion.guidance import AnyGuidance, MomentMatched, guide_towards
-from probmotion.samplers.diffusion.views import (
-    MultiViewDenoiser,
-    Views,
-    symmetric_power,
-    views_around,
-)
+from probmotion.samplers.diffusion.integrators import AnyIntegrator, SecondOrderSDE
+from probmotion.samplers.diffusion.noise_levels import AnyLevels, Karras
+from probmotion.samplers.diffusion.states import MotionState, State
+from probmotion.samplers.diffusion.views import Views, pools, symmetric_power, view_sets
 from probmotion.seeds import NormalStreams
 from probmotion.validation import check_count, check_positive
 
@@ -52,19 +52,20 @@ class MultiViewPredictorCorrector(AncestralSampler):
     corrector_size : float
         Step size ε of the corrector, in (0, 1].
     n_views : int
-        Number of orthographic views V, evenly spaced in azimuth; 120° apart if V = 2.
-    elevation : float
-        Elevation of all views, radians. At 0, a motion and its mirror image are indistinguishable.
+        Number of views of learnt denoisers, evenly spaced in azimuth.
+    elevation : float, optional
+        Elevation of these views, radians; by default that of the prior's training. Exact denoisers
+        hold for any view, and by default alternate between five sets of three orthogonal views.
     gamma : float
         Exponent γ at high noise, at least 0.
     gamma_from : float
         Noise level σ below which γ is 0.
     corrected_from : float
         Noise level σ below which corrector steps are skipped.
-    trained_steps : int, optional
-        Number of levels of the schedule from which T are selected; ``steps`` by default.
-    schedule_power : int
-        Power of the cosine schedule: 2 as published, 4 in the code of MAS.
+    levels : AnyLevels
+        Spacing of the noise levels.
+    integrator : AnyIntegrator
+        Integrator of the reverse diffusion.
     guidance : AnyGuidance
         Method of conditioning on the observations.
     batch : int
@@ -74,16 +75,16 @@ class MultiViewPredictorCorrector(AncestralSampler):
     name: ClassVar[str] = "mvpc"
     requires: ClassVar[tuple[type, ...]] = (Denoises2D,)
 
-    steps: int = 50
+    steps: int = 97
     corrector_steps: int = 1
-    corrector_size: float = 0.5
+    corrector_size: float = 0.6
     n_views: int = 5
-    elevation: float = math.pi / 16
+    elevation: float | None = None
     gamma: float = 0.5
-    gamma_from: float = 0.5
-    corrected_from: float = 0.15
-    trained_steps: int | None = None
-    schedule_power: int = 2
+    gamma_from: float = 1.0
+    corrected_from: float = 1.0
+    levels: AnyLevels = Karras(smallest=0.01)
+    integrator: AnyIntegrator = field(default_factory=SecondOrderSDE)
     guidance: AnyGuidance = field(default_factory=MomentMatched)
     batch: int = 256
 
@@ -102,7 +103,7 @@ class MultiViewPredictorCorrector(AncestralSampler):
     @classmethod
     def accurate(cls) -> MultiViewPredictorCorrector:
         """Return a sampler with a smaller error at three times the default cost."""
-        return cls(steps=100, corrector_steps=2, corrector_size=0.4)
+        return cls(steps=200, corrector_steps=2, corrector_size=0.4)
 
     def gamma_at(self, level: float) -> float:
         """Return γ at a noise level σ."""
@@ -111,11 +112,11 @@ class MultiViewPredictorCorrector(AncestralSampler):
     def _state(self, posterior: MotionPosterior) -> State:
         prior = posterior.prior
         assert isinstance(prior, Denoises2D)
-        views = Views(views_around(self.n_views, self.elevation))
-        denoiser = MultiViewDenoiser(prior, views)
-        guide = guide_towards(self, posterior, self.guidance, denoiser)
+        sets = view_sets(prior, self.n_views, self.elevation)
+        denoisers = pools(prior, sets)
+        guides = [guide_towards(self, posterior, self.guidance, each) for each in denoisers]
         shape = (posterior.frames, posterior.skeleton.n_joints, 3)
-        return MotionState(denoiser, self.schedule, shape, guide, self._noise_factor(views))
+        return MotionState(denoisers, self.schedule, shape, guides, self._noise_factor(sets[0]))
 
     def _options(self) -> dict[str, Any]:
         return {"corrector": self._correct} if self.corrector_steps else {}
@@ -132,7 +133,7 @@ class MultiViewPredictorCorrector(AncestralSampler):
 
     def _correct(self, state: State, streams: NormalStreams, x: np.ndarray, t: int) -> np.ndarray:
         """Return the state after the corrector steps at level t."""
-        if sigma(state.schedule, t) < self.corrected_from:
+        if state.schedule.sigma(t) < self.corrected_from:
             return x
         size, alpha_bar = self.corrector_size, float(state.schedule.alpha_bar[t])
         for _ in range(self.corrector_steps):

@@ -6,6 +6,7 @@ motions are in normalised units.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import cached_property
 
@@ -20,8 +21,8 @@ from probmotion.posteriors.protocols import (
 )
 
 __all__ = [
-    "MotionDenoiser", "MultiViewDenoiser", "StateDenoiser", "Views", "symmetric_power",
-    "views_around",
+    "MotionDenoiser", "MultiViewDenoiser", "StateDenoiser", "Views", "pools", "symmetric_power",
+    "view_sets", "views_around",
 ]  # fmt: skip
 
 
@@ -77,15 +78,48 @@ class Views:
 
 
 def views_around(
-    n_views: int, elevation: float, *, distance: float = 7.0, perspective: bool = False
+    n_views: int,
+    elevation: float,
+    *,
+    start: float = 0.0,
+    distance: float = 7.0,
+    perspective: bool = False,
 ) -> Cameras:
-    """Return the cameras of V views evenly spaced in azimuth from 0.
+    """Return the cameras of V views evenly spaced in azimuth from ``start``, in turns.
 
     Two views are 120° apart (MAS, table 2), since opposite views do not determine the depth.
     """
-    azimuth = 2 * np.pi * np.arange(n_views) / max(3, n_views)
+    azimuth = 2 * np.pi * (start + np.arange(n_views) / max(3, n_views))
     tilt = np.full(n_views, elevation)
     return Cameras.around(azimuth, tilt, distance=distance, perspective=perspective)
+
+
+def view_sets(
+    prior: Denoises2D, n_views: int, elevation: float | None, rings: int = 1
+) -> list[Views]:
+    """Return the sets of orthographic views between which a sampler alternates.
+
+    Estimates of single views are biased differently in different directions. A learnt denoiser
+    holds for the ``view_elevation`` of its training: rings of V views that differ in azimuth. An
+    exact one holds for any view: the 15 two-fold axes of an icosahedron cover the sphere evenly, in
+    five sets of three orthogonal axes, each of which weights all directions equally. A given
+    ``elevation`` is that of rings for any prior.
+    """
+    elevation = getattr(prior, "view_elevation", None) if elevation is None else elevation
+    if elevation is not None:
+        turns = np.arange(rings) / (rings * max(3, n_views))
+        return [Views(views_around(n_views, elevation, start=turn)) for turn in turns]
+    golden = (1 + math.sqrt(5)) / 2
+    first = 0.5 * np.array([[golden, 1.0, 1 / golden], [-1 / golden, golden, -1.0]])
+    triads = [np.eye(3)]
+    # Half-turns about two coordinate axes turn one triad into the other three.
+    for signs in ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]):
+        pair = first * signs
+        triads.append(np.concatenate([pair, np.cross(pair[0], pair[1])[None]]))
+    return [
+        Views(Cameras.around(np.arctan2(x, z), np.arcsin(np.clip(y, -1, 1))))
+        for x, y, z in (triad.T for triad in triads)
+    ]
 
 
 class MotionDenoiser:
@@ -115,15 +149,18 @@ class MotionDenoiser:
 class MultiViewDenoiser:
     """3D denoiser of MAS, D(X, t) = M⁻¹ Σ_v w_v P_vᵀ E[x₀ | P_v X, t], from a 2D denoiser.
 
-    D approximates E[X₀ | X_t]: each term conditions on a single view instead of X_t.
+    D approximates E[X₀ | X_t]: each term conditions on a single view instead of X_t. Evaluations
+    are added to ``counts``.
     """
 
     covariance_protocol = DenoiserCovariance2D
 
-    def __init__(self, prior: Denoises2D, views: Views) -> None:
+    def __init__(
+        self, prior: Denoises2D, views: Views, counts: dict[str, int] | None = None
+    ) -> None:
         self.prior = prior
         self.views = views
-        self.counts = {"denoiser": 0}
+        self.counts = {"denoiser": 0} if counts is None else counts
         self.gram = views.gram
 
     def denoise(self, x_t: np.ndarray, alpha_bar: float) -> np.ndarray:
@@ -150,6 +187,12 @@ class MultiViewDenoiser:
     @cached_property
     def _half(self) -> np.ndarray:
         return symmetric_power(self.gram, -0.5)
+
+
+def pools(prior: Denoises2D, sets: Sequence[Views]) -> list[MultiViewDenoiser]:
+    """Return the denoisers of sets of views, with common counts of evaluations."""
+    counts = {"denoiser": 0}
+    return [MultiViewDenoiser(prior, views, counts) for views in sets]
 
 
 StateDenoiser = MotionDenoiser | MultiViewDenoiser

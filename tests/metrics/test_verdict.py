@@ -15,8 +15,10 @@ from probmotion.metrics.run_statistics import DrawStatistics, draw_statistics
 from probmotion.metrics.verdict import Verdict, judge
 from probmotion.posteriors.draws import MotionDraws
 from probmotion.problems import load_problem
+from probmotion.samplers.diffusion import DDPM, Cosine
 
 N, REPEATS = 400, 10
+FIRST_ORDER = {"levels": Cosine(), "integrator": DDPM()}
 
 
 @dataclass(frozen=True)
@@ -152,7 +154,7 @@ def test_chains_that_disagree_are_not_mixed(gait):
     ("name", "sampler", "settings", "fault"),
     [
         ("gait", "dvae", {"training_steps": 20, "training_pairs": 200}, "off the manifold"),
-        ("monocular", "ancestral3d", {"steps": 20}, "overconfident"),
+        ("monocular", "ancestral3d", {"steps": 20, **FIRST_ORDER}, "overconfident"),
     ],
 )
 def test_a_wrong_sampler_is_not_right(name, sampler, settings, fault, request):
@@ -164,9 +166,12 @@ def test_a_wrong_sampler_is_not_right(name, sampler, settings, fault, request):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "sampler"), [("gait", "dvae"), ("gait-monocular", "ancestral3d")])
-def test_a_wrong_sampler_is_never_right(name, sampler):
+@pytest.mark.parametrize(
+    ("name", "sampler", "settings"),
+    [("gait", "dvae", {}), ("gait-monocular", "ancestral3d", {"steps": 100, **FIRST_ORDER})],
+)
+def test_a_wrong_sampler_is_never_right(name, sampler, settings):
     problem = load_problem(name)
     for seed in range(3):
-        draws = pm.sample(problem, sampler, draws=N, seed=seed, progress=False)
+        draws = pm.sample(problem, sampler, draws=N, seed=seed, progress=False, **settings)
         assert pm.score(problem, draws, seed=seed).verdict.is_wrong

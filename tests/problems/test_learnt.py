@@ -21,6 +21,7 @@ from probmotion.motion.distances import mirrored_fraction, nearest_distances, wi
 from probmotion.posteriors.sampling import load_sampler
 from probmotion.problems import load_problem
 from probmotion.samplers import NUTS, MultiViewAncestral
+from probmotion.samplers.diffusion.noise_levels import Cosine
 
 WEIGHTS = Path(models.__file__).parent / "weights"
 
@@ -32,7 +33,7 @@ def problem():
 
 @pytest.fixture(scope="module")
 def draws(problem):
-    sampler = MultiViewAncestral(steps=20, trained_steps=100, perspective=True)
+    sampler = MultiViewAncestral(steps=20, levels=Cosine(trained_steps=100), perspective=True)
     return sampler.sample(problem.posterior, draws=24, seed=0, progress=False)
 
 

@@ -28,6 +28,7 @@ QUICK = {
     "ancestral3d": {"steps": 5},
     "mas": {"steps": 5},
     "mvpc": {"steps": 5},
+    "split-gibbs": {"steps": 5, "sweeps": 1, "start_steps": 3},
     "sds": {"iterations": 5, "n_views": 2},
     "mh": {"warmup": 20, "thin": 2},
     "nuts": {"warmup": 20},
@@ -142,7 +143,7 @@ def test_draws_with_an_exact_denoiser_are_bit_identical_for_any_batch(kind):
     np.testing.assert_array_equal(subset.positions.values[0], full[0, :2])
 
 
-@pytest.mark.parametrize("name", ["exact", "ancestral3d", "mas", "mvpc", "sds"])
+@pytest.mark.parametrize("name", ["exact", "ancestral3d", "mas", "mvpc", "split-gibbs", "sds"])
 @pytest.mark.parametrize("problem", ["gait", "gait-monocular", "gait-noisy3d"])
 def test_suited_samplers_are_those_that_sample(problem, name):
     posterior = load_problem(f"{problem}(frames=4, components=3)").posterior
@@ -151,7 +152,9 @@ def test_suited_samplers_are_those_that_sample(problem, name):
     if name in suited(posterior):
         kind(**effort).sample(posterior, draws=1, progress=False)
         return
-    with pytest.raises(UnsupportedPosterior, match=r"; try .*dvae, .*mh, .*nuts$"):
+    with pytest.raises(
+        UnsupportedPosterior, match=r"; try .*dvae, .*mh, .*nuts(, sds|, split-gibbs)?$"
+    ):
         kind(**effort).sample(posterior, draws=1, progress=False)
 
 

@@ -20,6 +20,7 @@ from probmotion.samplers import (
 )
 from probmotion.samplers.diffusion.ancestral2d import Ancestral2D
 from probmotion.samplers.diffusion.guidance import DPS, MomentMatched, WeightedTriangulation
+from probmotion.samplers.diffusion.noise_levels import Cosine
 from probmotion.samplers.mcmc.proposals import AdaptiveCovariance, Isotropic, VelocityBiased
 from probmotion.samplers.variational.amortised import AmortisedSettings
 
@@ -45,7 +46,11 @@ FREEDOM = "degrees_of_freedom must be a number above 0 or inf"
         (VelocityBiased, {"target": "0.2"}, "target must be between 0 and 1, got '0.2'"),
         (VelocityBiased, {"bias": 0.0}, f"bias {POSITIVE}"),
         (Ancestral2D, {"batch": 0}, f"batch {COUNT} 1"),
-        (Ancestral3D, {"steps": 200, "trained_steps": 100}, "steps must be at most the sched.*100"),
+        (
+            Ancestral3D,
+            {"steps": 200, "levels": Cosine(trained_steps=100)},
+            "steps must be at most the sched.*100",
+        ),
         (MultiViewAncestral, {"n_views": 1}, f"n_views {COUNT} 2"),
         (MultiViewAncestral, {"stop_level": 101}, "stop_level must be at most steps, 100, got 101"),
         (MultiViewAncestral, {"view_weights": (1.0, 2.0)}, r"view_weights must have shape \(5\)"),
@@ -79,9 +84,11 @@ def test_settings_out_of_range(kind, settings, message):
 
 def test_presets():
     code = MultiViewAncestral.reference_code()
-    assert code == MultiViewAncestral(n_views=7, perspective=True, schedule_power=4, stop_level=2)
+    assert code == MultiViewAncestral(
+        n_views=7, perspective=True, levels=Cosine(power=4), stop_level=2
+    )
     assert MultiViewPredictorCorrector.accurate() == MultiViewPredictorCorrector(
-        steps=100, corrector_steps=2, corrector_size=0.4
+        steps=200, corrector_steps=2, corrector_size=0.4
     )
     assert ScoreDistillation.reference_code() == ScoreDistillation(
         iterations=1000, weighting="residual", arc=1.0, schedule_power=4
@@ -95,6 +102,6 @@ def test_presets():
     "kind", [Ancestral2D, Ancestral3D, MultiViewAncestral, MultiViewPredictorCorrector]
 )
 def test_levels_are_strided_from_a_longer_schedule(kind):
-    schedule = kind(steps=20, trained_steps=100, schedule_power=4).schedule
+    schedule = kind(steps=20, levels=Cosine(power=4, trained_steps=100)).schedule
     expected = NoiseSchedule.cosine(100, power=4).alpha_bar[::5]
     np.testing.assert_array_equal(schedule.alpha_bar, expected)

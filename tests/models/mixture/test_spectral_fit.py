@@ -176,3 +176,12 @@ def test_held_out_density_is_that_of_the_prior():
     fitted = {name: getattr(one, name) for name in (*names, "scales", "scale_weights")}
     density = spectral_fit._log_density(fitted, coefficients, one.fps)
     np.testing.assert_allclose(density, one.log_prior(windows), rtol=1e-9)
+
+
+def test_shipped_prior_of_all_clips_is_symmetric():
+    """It is fitted to clips and their mirror images; the first component is that of all windows."""
+    prior = SpectralMixtureMotion.load("cmu-motion")
+    order = list(prior.skeleton.mirrored_order)
+    images = prior.poses[:, order] * [-1.0, 1.0, 1.0]
+    np.testing.assert_allclose(images[0], prior.poses[0], atol=1e-6)
+    assert abs(prior.velocities[0, 0]) < 1e-6

@@ -10,8 +10,11 @@ import pytest
 
 from probmotion import Cameras, MotionPosterior, NoiseSchedule, UnsupportedPosterior
 from probmotion.samplers import Ancestral3D
-from probmotion.samplers.diffusion.ancestral import MotionState, ancestral, sigma
+from probmotion.samplers.diffusion.ancestral import ancestral
 from probmotion.samplers.diffusion.ancestral2d import Ancestral2D
+from probmotion.samplers.diffusion.integrators import DDPM
+from probmotion.samplers.diffusion.noise_levels import Cosine
+from probmotion.samplers.diffusion.states import MotionState
 from probmotion.samplers.diffusion.views import MotionDenoiser
 from probmotion.seeds import NormalStreams
 
@@ -56,7 +59,7 @@ def test_views_have_the_exact_moments(gaussian, assert_covariance, camera):
 
 @pytest.mark.parametrize("power", [2, 4])
 def test_motions_have_the_exact_moments(gaussian, assert_covariance, power):
-    sampler = Ancestral3D(steps=10, schedule_power=power)
+    sampler = Ancestral3D(steps=10, levels=Cosine(power=power), integrator=DDPM())
     draws = sampler.sample(MotionPosterior(gaussian), draws=8000, seed=1, progress=False)
     assert draws.counts == {"denoiser": 80_000}
     assert draws.independent
@@ -84,15 +87,18 @@ def test_steps_agree_with_diffusers(gaussian):
     oracle.alphas_cumprod = torch.tensor(schedule.alpha_bar[1:])
     recorded = []
     denoiser = MotionDenoiser(gaussian)
-    state = MotionState(denoiser, schedule, (2, 2, 3))
+    state = MotionState([denoiser], schedule, (2, 2, 3))
     streams = NormalStreams([np.random.default_rng(0)])
-    result = ancestral(state, streams, lambda: None, watch=lambda *pair: recorded.append(pair))
-    estimates, noises = zip(*recorded, strict=True)
+    result = ancestral(
+        state, streams, lambda: None, DDPM(), watch=lambda *pair: recorded.append(pair)
+    )
+    transitions, noises = zip(*recorded, strict=True)
 
     x = torch.tensor(noises[0])
     for t in range(steps, 0, -1):
         clean = denoiser.denoise(x.numpy(), schedule.alpha_bar[t])
-        np.testing.assert_allclose(clean, estimates[steps - t + 1], atol=1e-6)
+        estimate = transitions[steps - t + 1].estimate if t > 1 else result
+        np.testing.assert_allclose(clean, estimate, atol=1e-6)
         # diffusers draws the noise itself: solve for its mean and deviation from two seeds.
         samples, noise = [], []
         for seed in (0, 1):
@@ -111,7 +117,7 @@ def test_steps_agree_with_diffusers(gaussian):
 def test_noise_levels_match_the_schedule():
     schedule = NoiseSchedule.cosine(10)
     for t in range(1, 11):
-        assert 1 / (1 + sigma(schedule, t) ** 2) == pytest.approx(schedule.alpha_bar[t])
+        assert 1 / (1 + schedule.sigma(t) ** 2) == pytest.approx(schedule.alpha_bar[t])
 
 
 def test_a_view_depends_only_on_its_seed_and_number(gaussian):

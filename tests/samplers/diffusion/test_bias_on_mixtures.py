@@ -56,7 +56,7 @@ def metrics(prior, sampler, run_seeds, n=DRAWS):
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
-# Both use 475 calls per draw: 50 predictor and 45 corrector steps, or 95 steps, of 5 views.
+# Calls per draw: 97 predictor and 61 corrector steps of 3 views, and 95 steps of 5 views.
 EQUAL_COST = (MultiViewPredictorCorrector(), MultiViewAncestral(steps=95))
 
 
@@ -64,7 +64,8 @@ def test_mvpc_is_more_accurate_than_mas_on_a_few_draws():
     """This is the fast version of the slow test below, in reduced coordinates."""
     reduced, _ = gaits().reduced()
     mvpc, mas = (metrics(reduced, sampler, [0], 100) for sampler in EQUAL_COST)
-    assert mvpc["calls"] == mas["calls"] == 475
+    assert mvpc["calls"] == 474
+    assert mas["calls"] == 475
     for name in ("swd_ratio", "off_manifold_ratio", "variance_ratio"):
         assert abs(np.log(mvpc[name])) < abs(np.log(mas[name])) - 0.1, name
 

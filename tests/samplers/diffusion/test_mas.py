@@ -16,6 +16,8 @@ from scipy.integrate import quad
 from probmotion import Cameras, MotionPosterior, NoiseSchedule, triangulate
 from probmotion.posteriors.sampling import Interrupted
 from probmotion.samplers import MultiViewAncestral
+from probmotion.samplers.diffusion.integrators import DDPM, Heun, SecondOrderSDE
+from probmotion.samplers.diffusion.noise_levels import Cosine
 from probmotion.samplers.diffusion.views import MultiViewDenoiser, Views
 
 ELEVATION = math.radians(15)
@@ -163,12 +165,12 @@ def test_limit_6_finitely_many_steps_shrink_variance(gaussian_motion, variance, 
     [
         {},
         {"shared_noise": False},
-        {"variance_for_deviation": True},
+        {"integrator": DDPM(variance_for_deviation=True)},
         {"view_weights": (3.0, 1.0, 0.5)},
-        {"schedule_power": 4},
-        {"trained_steps": 100},
+        {"levels": Cosine(power=4)},
+        {"levels": Cosine(trained_steps=100)},
     ],
-    ids=lambda options: "-".join(options) or "default",
+    ids=lambda options: "-".join(map(str, options.values())) or "default",
 )
 def test_draws_have_the_exact_covariance(gaussian, assert_covariance, options):
     sampler = MultiViewAncestral(steps=10, n_views=3, elevation=ELEVATION, **options)
@@ -179,7 +181,7 @@ def test_draws_have_the_exact_covariance(gaussian, assert_covariance, options):
         Views(sampler.cameras, sampler.view_weights),
         sampler.schedule,
         shared_noise=sampler.shared_noise,
-        power=2 if sampler.variance_for_deviation else 1,
+        power=2 if sampler.integrator.variance_for_deviation else 1,
     )
     # The relative error of the mean is √ᾱ_T, far below the Monte Carlo error.
     assert_covariance(draws.flat() - gaussian.mean, expected * gaussian.scale**2)
@@ -189,13 +191,13 @@ def test_stop_level_returns_the_estimate_at_that_level(gaussian):
     posterior = MotionPosterior(gaussian)
     sampler = MultiViewAncestral(steps=10, stop_level=2)
     trace = sampler.trace(posterior, draws=3)
-    assert len(trace.estimates) == 9
+    assert len(trace.steps) == 8
     draws = sampler.sample(posterior, draws=3, progress=False)
-    np.testing.assert_array_equal(draws.flat(), trace.estimates[-1] * gaussian.scale)
+    np.testing.assert_array_equal(draws.flat(), trace.result * gaussian.scale)
     assert draws.counts == {"denoiser": 9 * 5 * 3}
     assert draws.independent
     complete = MultiViewAncestral(steps=10).trace(posterior, draws=3)
-    np.testing.assert_array_equal(trace.estimates, complete.estimates[:-1])
+    np.testing.assert_array_equal(trace.result, complete.steps[-1].estimate)
 
 
 def test_distant_perspective_views_are_orthographic(gaussian):
@@ -211,13 +213,15 @@ def test_distant_perspective_views_are_orthographic(gaussian):
     assert errors[1] == pytest.approx(errors[0] / 10, rel=0.05)
 
 
+@pytest.mark.parametrize("integrator", [DDPM(), SecondOrderSDE(), Heun()])
 @pytest.mark.parametrize("perspective", [False, True])
-def test_replay_in_any_view(gaussian, perspective):
+def test_replay_in_any_view(gaussian, perspective, integrator):
     posterior = MotionPosterior(gaussian)
-    sampler = MultiViewAncestral(steps=40, perspective=perspective)
+    sampler = MultiViewAncestral(steps=40, perspective=perspective, integrator=integrator)
     trace = sampler.trace(posterior, draws=2, seed=1)
     draws = sampler.sample(posterior, draws=2, seed=1, progress=False).flat()
-    np.testing.assert_array_equal(trace.estimates[-1] * gaussian.scale, draws)
+    np.testing.assert_array_equal(trace.result * gaussian.scale, draws)
+    estimates = [*(step.estimate for step in trace.steps), trace.result]
     # Denoising the replay in the views of the run reproduces its estimates.
     for level in (40, 20, 5, 1):
         noisy = trace.replay(sampler.cameras, level)
@@ -225,7 +229,7 @@ def test_replay_in_any_view(gaussian, perspective):
         again = triangulate(clean * gaussian.scale, sampler.cameras, iterations=20) / gaussian.scale
         # A run triangulates perspective views in two iterations only.
         tolerance = 1e-3 if perspective else 1e-12
-        np.testing.assert_allclose(again, trace.estimates[40 - level], atol=tolerance)
+        np.testing.assert_allclose(again, estimates[40 - level], atol=tolerance)
     # In a new view the replay is the projection of one 3D state.
     new = Cameras.around([0.7], [0.4], perspective=perspective)
     if not perspective:

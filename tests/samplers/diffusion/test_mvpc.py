@@ -10,22 +10,32 @@ import pytest
 
 from probmotion import Cameras, MotionPosterior
 from probmotion.samplers import MultiViewAncestral, MultiViewPredictorCorrector
-from probmotion.samplers.diffusion.views import MultiViewDenoiser, Views
+from probmotion.samplers.diffusion import DDPM, Cosine, SecondOrderSDE
+from probmotion.samplers.diffusion.views import MultiViewDenoiser, Views, pools, view_sets
 
 
 def test_mvpc_without_gamma_and_corrector_equals_mas(gaussian):
     posterior = MotionPosterior(gaussian)
-    predictor_only = MultiViewPredictorCorrector(steps=20, gamma=0.0, corrector_steps=0)
+    predictor_only = MultiViewPredictorCorrector(
+        steps=20, gamma=0.0, corrector_steps=0, elevation=math.pi / 16
+    )
     mvpc, mas = (
         sampler.sample(posterior, draws=6, seed=3, progress=False)
-        for sampler in (predictor_only, MultiViewAncestral(steps=20))
+        for sampler in (
+            predictor_only,
+            MultiViewAncestral(
+                steps=20,
+                levels=predictor_only.levels,
+                integrator=predictor_only.integrator,
+            ),
+        )
     )
     np.testing.assert_array_equal(mvpc.positions, mas.positions)
     assert mvpc.counts == mas.counts
 
 
 @pytest.mark.parametrize(
-    ("settings", "calls"), [({}, 475), ({"steps": 100, "corrector_steps": 3}, 1865)]
+    ("settings", "calls"), [({}, 3 * 158), ({"elevation": 0.2, "corrector_steps": 3}, 5 * 280)]
 )
 def test_evaluations_are_counted(gaussian, settings, calls):
     sampler = MultiViewPredictorCorrector(**settings)
@@ -35,7 +45,7 @@ def test_evaluations_are_counted(gaussian, settings, calls):
 
 def test_gamma_by_noise_level():
     sampler = MultiViewPredictorCorrector()
-    levels = (0.01, 0.15, 0.499, 0.5, 1.0, 50.0)
+    levels = (0.01, 0.5, 0.999, 1.0, 2.0, 50.0)
     assert [sampler.gamma_at(level) for level in levels] == [0, 0, 0, 0.5, 0.5, 0.5]
 
 
@@ -43,33 +53,66 @@ def mvpc_covariance(prior, sampler):
     """Return the exact covariance of the sampler on a zero-mean Gaussian prior."""
     n = prior.dim
     unit = np.eye(n).reshape(n, *prior.mean.shape)
-    views = Views(Cameras.ring(sampler.n_views, elevation=sampler.elevation))
-    denoiser = MultiViewDenoiser(prior, views)
+    denoisers = pools(prior, view_sets(prior, sampler.n_views, sampler.elevation))
+    views, turns = denoisers[0].views, iter(range(1000))
     schedule, size = sampler.schedule, sampler.corrector_size
     sigma = np.sqrt(1 / schedule.alpha_bar - 1)
-    values, vectors = np.linalg.eigh(sampler.n_views * np.linalg.inv(views.gram))
+    values, vectors = np.linalg.eigh(views.n_views * np.linalg.inv(views.gram))
+    second_order = isinstance(sampler.integrator, SecondOrderSDE)
 
     def matrix(t):
+        denoiser = denoisers[next(turns) % len(denoisers)]
         return denoiser.denoise(unit, schedule.alpha_bar[t]).reshape(n, n).T
 
     def noise(t):
-        power = sampler.gamma if sigma[t] >= 0.5 else 0.0
+        power = sampler.gamma if sigma[t] >= sampler.gamma_from else 0.0
         return np.kron(np.eye(n // 3), (vectors * values**power) @ vectors.T)
 
-    covariance = noise(schedule.steps)
+    def grown(covariance, move, added):
+        """Return the covariance of (move (x, D), D) plus noise in x, for the pair (x, D)."""
+        both = move @ covariance @ move.T
+        both[:n, :n] += added
+        return both
+
+    # The pair of the state and the previous estimate is linear in the noises.
+    covariance = np.zeros((2 * n, 2 * n))
+    covariance[:n, :n] = noise(schedule.steps)
+    identity, zero = np.eye(n), np.zeros((n, n))
     for t in range(schedule.steps, 1, -1):
-        step = schedule.posterior(t)
-        move = step.clean * matrix(t) + step.noisy * np.eye(n)
-        covariance = move @ covariance @ move.T + step.deviation**2 * noise(t - 1)
-        if sigma[t - 1] >= 0.15:
+        step, D = schedule.posterior(t), matrix(t)
+        ratio = 0.0
+        if second_order and t < schedule.steps:
+            steps = np.log(sigma[t] / sigma[t - 1]), np.log(sigma[t + 1] / sigma[t])
+            ratio = 0.5 * min(steps[0] / steps[1], 2.0)
+        move = np.block(
+            [
+                [
+                    step.noisy * identity + step.clean * (1 + ratio) * D,
+                    -step.clean * ratio * identity,
+                ],
+                [D, zero],
+            ]
+        )
+        covariance = grown(covariance, move, step.deviation**2 * noise(t - 1))
+        if sigma[t - 1] >= sampler.corrected_from:
             alpha_bar = schedule.alpha_bar[t - 1]
-            move = (1 - size) * np.eye(n) + size * math.sqrt(alpha_bar) * matrix(t - 1)
             for _ in range(sampler.corrector_steps):
-                covariance = move @ covariance @ move.T + 2 * size * (1 - alpha_bar) * noise(t - 1)
-    return matrix(1) @ covariance @ matrix(1).T
+                drift = (1 - size) * identity + size * math.sqrt(alpha_bar) * matrix(t - 1)
+                move = np.block([[drift, zero], [zero, identity]])
+                covariance = grown(covariance, move, 2 * size * (1 - alpha_bar) * noise(t - 1))
+    last = matrix(1)
+    return last @ covariance[:n, :n] @ last.T
 
 
-@pytest.mark.parametrize("options", [{"corrector_steps": 0, "gamma": 0.8}, {"corrector_steps": 2}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"corrector_steps": 0, "gamma": 0.8},
+        {"corrector_steps": 2},
+        {"levels": Cosine(), "integrator": DDPM()},
+        {"elevation": 0.3},
+    ],
+)
 def test_draws_have_the_exact_covariance(gaussian, assert_covariance, options):
     sampler = MultiViewPredictorCorrector(steps=8, **options)
     draws = sampler.sample(MotionPosterior(gaussian), draws=10_000, seed=4, progress=False)
@@ -79,7 +122,8 @@ def test_draws_have_the_exact_covariance(gaussian, assert_covariance, options):
 
 def test_an_isotropic_gaussian_is_not_sampled_exactly(gaussian_motion):
     prior = gaussian_motion(np.zeros((1, 1, 3)), np.eye(3))
-    variance = np.diag(mvpc_covariance(prior, MultiViewPredictorCorrector()))
+    sampler = MultiViewPredictorCorrector(elevation=math.pi / 16, gamma=0.5)
+    variance = np.diag(mvpc_covariance(prior, sampler))
     # Λ is about (1.9, 1, 1.9), and the variance is larger along the same axes.
     assert variance[0] > 1.1
     assert variance[0] > variance[1] + 0.1

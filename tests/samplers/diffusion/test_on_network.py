@@ -25,6 +25,7 @@ from probmotion.samplers.diffusion.guidance import (
     Replacement,
     WeightedTriangulation,
 )
+from probmotion.samplers.diffusion.noise_levels import Cosine
 from probmotion.threads import one_thread
 
 BODY = Skeleton(["root", "left_hand", "right_hand", "head"], [-1, 0, 0, 0])
@@ -71,9 +72,12 @@ OPTIONS = [
     (MultiViewAncestral, {"perspective": True, "distance": 4.0}),
     (MultiViewAncestral, {"perspective": True, "view_weights": (5.0, 1.0, 1.0, 1.0, 1.0)}),
     (MultiViewAncestral, {"perspective": True, "shared_noise": False}),
-    (MultiViewAncestral, {"perspective": True, "trained_steps": 100}),
+    (MultiViewAncestral, {"perspective": True, "levels": Cosine(trained_steps=100)}),
     (MultiViewAncestral, {"stop_level": 2}),
-    (MultiViewPredictorCorrector, {"corrector_steps": 2, "trained_steps": 100, "n_views": 3}),
+    (
+        MultiViewPredictorCorrector,
+        {"corrector_steps": 2, "n_views": 3},
+    ),
     (ScoreDistillation, {"levels": "annealed"}),
     (ScoreDistillation, {"shared_noise": True, "n_views": 3}),
     (ScoreDistillation, {"weighting": "residual"}),
@@ -92,8 +96,9 @@ def test_every_option_changes_the_draws(prior, kind, options):
 
 
 def test_motions_are_upright(prior):
+    levels = Cosine(trained_steps=100)
     for perspective in (False, True):
-        sampler = MultiViewAncestral(steps=25, trained_steps=100, perspective=perspective)
+        sampler = MultiViewAncestral(steps=25, levels=levels, perspective=perspective)
         motions = draw(sampler, prior, draws=4)
         height = motions[..., 3, 1] - motions[..., 0, 1]
         # Y is up in 3D and down in images.
@@ -102,7 +107,10 @@ def test_motions_are_upright(prior):
 
 
 def test_single_views(prior):
-    sampler, posterior = Ancestral2D(steps=20, trained_steps=100), MotionPosterior(prior)
+    sampler, posterior = (
+        Ancestral2D(steps=20, levels=Cosine(trained_steps=100)),
+        MotionPosterior(prior),
+    )
     views = sampler.sample_views(posterior, draws=4, progress=False)
     assert views.shape == (4, 10, 4, 2)
     assert views[:, :, 3, 1].mean() == pytest.approx(-0.6, abs=0.15)
@@ -112,7 +120,7 @@ def test_single_views(prior):
 
 GUIDED = [
     *(
-        MultiViewAncestral(steps=15, trained_steps=100, guidance=guidance)
+        MultiViewAncestral(steps=15, levels=Cosine(trained_steps=100), guidance=guidance)
         for guidance in (MomentMatched(), Replacement(), WeightedTriangulation(20.0), DPS(0.5))
     ),
     MultiViewPredictorCorrector(steps=15),

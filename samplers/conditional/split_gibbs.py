@@ -1,0 +1,218 @@
+"""Split Gibbs sampler: prior and observations meet in an auxiliary motion.
+
+The joint density p(x) N(z; x, ρ²) N(y; A z, σ_y² − ρ²) has the marginal p(x) N(y; A x, σ_y²), the
+posterior, for any ρ < σ_y (Vono et al. 2019; the subtraction of ρ² makes it exact at finite ρ).
+Gibbs sweeps alternate between z | x, a Gaussian per frame and joint, and x | z, the reverse
+diffusion from noise level ρ, started at z (Wu et al. 2024, Xu and Chi 2024).
+
+Sweeps move by about ρ, and need thousands to cross the unobserved depth. The marginal of z,
+p_ρ(z) N(y; A z, σ_y² − ρ²), has the score (D(z, ρ) − z)/ρ² + Aᵀ (y − A z)/(σ_y² − ρ²) at the cost
+of one estimate D, so underdamped Langevin dynamics of z under falling ρ come before the sweeps.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, ClassVar
+
+import numpy as np
+
+from probmotion.posteriors.posterior import MotionPosterior
+from probmotion.samplers.conditional.base import (
+    ConditionalSampler,
+    DenoiserChoice,
+    VarianceExploding,
+)
+from probmotion.samplers.conditional.coupling import Coupling, times
+from probmotion.samplers.diffusion.ancestral import AncestralSampler
+from probmotion.samplers.diffusion.ancestral3d import Ancestral3D
+from probmotion.samplers.diffusion.guidance import LinearObservations
+from probmotion.samplers.diffusion.mvpc import MultiViewPredictorCorrector
+from probmotion.samplers.diffusion.noise_levels import Karras
+from probmotion.samplers.independent import Batches
+from probmotion.seeds import NormalStreams
+from probmotion.validation import check_count, check_positive
+
+__all__ = ["SplitGibbs"]
+
+_RINGS = 3  # of views of learnt denoisers
+_STEPS_PER_LEVEL = 4  # Langevin steps at one ρ
+_ANNEALED_TO = 0.7  # last ρ of the Langevin dynamics, in σ_y
+_STEP, _FRICTION = 0.7, 0.2  # of the Langevin dynamics, in units of the coupling's deviations
+_END = 0.1  # last noise level of the reverse diffusion, in ρ
+_POWER = 5  # of its spacing (Karras et al. 2022, equation 5)
+_MAX_RATIO = 2.0  # of consecutive steps in the extrapolation of estimates
+
+
+@dataclass(frozen=True)
+class SplitGibbs(ConditionalSampler):
+    """Split Gibbs sampler with a diffusion prior, started by guided sampling.
+
+    Parameters
+    ----------
+    steps : int
+        Number of Langevin steps under falling ρ.
+    sweeps : int
+        Number of Gibbs sweeps at the last ρ.
+    inner_steps : int
+        Number of estimates of each reverse diffusion.
+    largest : float
+        First ρ, normalised units. Larger values leave the mode of the guided start.
+    share : float
+        Last ρ in units of the smallest σ_y, below 1.
+    start_steps : int
+        Number of noise levels of the guided start.
+    denoiser : {"any", "3d", "2d"}
+        Kind of denoiser; "any" is the 3D denoiser if the prior has one.
+    n_views : int
+        Number of views of learnt denoisers, evenly spaced in azimuth.
+    elevation : float, optional
+        Elevation of these views, radians; by default that of the prior's training. Exact denoisers
+        hold for any view, and by default alternate between five sets of three orthogonal views.
+    batch : int
+        Maximum batch size; does not affect the draws.
+    """
+
+    name: ClassVar[str] = "split-gibbs"
+
+    steps: int = 400
+    sweeps: int = 5
+    inner_steps: int = 8
+    largest: float = 0.4
+    share: float = 0.95
+    start_steps: int = 30
+    denoiser: DenoiserChoice = "any"
+    n_views: int = 5
+    elevation: float | None = None
+    batch: int = 256
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, least in (("steps", 0), ("sweeps", 1), ("inner_steps", 2), ("start_steps", 2)):
+            check_count(name, getattr(self, name), least=least)
+        check_count("n_views", self.n_views, least=3)
+        check_count("batch", self.batch)
+        check_positive("largest", self.largest)
+        check_positive("share", self.share)
+        if self.share >= 1:
+            raise ValueError(
+                f"share must be below 1, as ρ must end below the noise of the observations, got "
+                f"{self.share}; use .95"
+            )
+
+    def _start(self, three_dimensional: bool) -> AncestralSampler:
+        """Return the guided sampler of the starting points."""
+        if three_dimensional:
+            return Ancestral3D(steps=self.start_steps, levels=Karras(smallest=0.04))
+        return MultiViewPredictorCorrector(
+            steps=self.start_steps,
+            levels=Karras(smallest=0.1),
+            n_views=self.n_views,
+            elevation=self.elevation,
+            gamma=0.0,
+            corrected_from=0.4,
+            corrector_size=0.3,
+        )
+
+    def _batches(self, posterior: MotionPosterior, seed: int, progress: bool) -> Batches:
+        observations = self._observations(posterior)
+        pools = self._pools(posterior, self.n_views, self.elevation, _RINGS)
+        start = self._start(len(pools) == 1)._batches(posterior, seed, progress)
+        sources = [start.counts, pools[0].denoiser.counts]
+        counts = {"denoiser": 0}
+
+        def draw(streams: NormalStreams, tick: Callable[[], Any]) -> np.ndarray:
+            x = start.draw(streams, tick)
+            x = self._anneal(pools, observations, x, streams, tick)
+            x = self._sweep(pools, observations, x, streams, tick)
+            for name in {name for source in sources for name in source}:
+                counts[name] = sum(source.get(name, 0) for source in sources)
+            return x
+
+        ticks = start.steps + self.steps + self.sweeps
+        scale = posterior.prior.scale  # type: ignore[attr-defined]
+        return Batches(draw, self.batch, ticks, scale, counts)
+
+    def _noise(self, observations: LinearObservations) -> float:
+        """Return the smallest σ_y, normalised units."""
+        return 1 / math.sqrt(observations.precision.max())
+
+    def _anneal(
+        self,
+        pools: list[VarianceExploding],
+        observations: LinearObservations,
+        x: np.ndarray,
+        streams: NormalStreams,
+        tick: Callable[[], Any],
+    ) -> np.ndarray:
+        """Return x after Langevin dynamics of z (BAOAB, Leimkuhler and Matthews 2013)."""
+        if self.steps == 0:
+            return x
+        shape = x.shape[1:]
+        last = _ANNEALED_TO * self._noise(observations)
+        levels = -(-self.steps // _STEPS_PER_LEVEL)
+        rhos = np.geomspace(max(self.largest, last), last, levels)
+        z = Coupling(observations, rhos[0], split=True).draw(x, streams.normal(*shape))
+        velocity = streams.normal(*shape)
+        kept = math.exp(-_FRICTION * _STEP)
+        for level, rho in enumerate(rhos):
+            clean = pools[level % len(pools)]
+            coupling = Coupling(observations, rho, split=True)
+
+            def kick(
+                z: np.ndarray,
+                clean: VarianceExploding = clean,
+                coupling: Coupling = coupling,
+                rho: float = rho,
+            ) -> np.ndarray:
+                return 0.5 * _STEP * times(coupling.root, coupling.score(z, clean(z, rho)))
+
+            force = kick(z)
+            for _ in range(min(_STEPS_PER_LEVEL, self.steps - level * _STEPS_PER_LEVEL)):
+                velocity = velocity + force
+                z = z + 0.5 * _STEP * times(coupling.root, velocity)
+                velocity = kept * velocity + math.sqrt(1 - kept**2) * streams.normal(*shape)
+                z = z + 0.5 * _STEP * times(coupling.root, velocity)
+                force = kick(z)
+                velocity = velocity + force
+                tick()
+        return self._reverse(pools[-1], z, rhos[-1], streams)
+
+    def _sweep(
+        self,
+        pools: list[VarianceExploding],
+        observations: LinearObservations,
+        x: np.ndarray,
+        streams: NormalStreams,
+        tick: Callable[[], Any],
+    ) -> np.ndarray:
+        """Return x after Gibbs sweeps at the last ρ."""
+        rho = self.share * self._noise(observations)
+        coupling = Coupling(observations, rho, split=True)
+        for sweep in range(self.sweeps):
+            z = coupling.draw(x, streams.normal(*x.shape[1:]))
+            x = self._reverse(pools[sweep % len(pools)], z, rho, streams)
+            tick()
+        return x
+
+    def _reverse(
+        self, clean: VarianceExploding, z: np.ndarray, rho: float, streams: NormalStreams
+    ) -> np.ndarray:
+        """Return a draw of x | z: second-order reverse diffusion from σ = ρ (Lu et al. 2022)."""
+        roots = np.linspace(rho ** (1 / _POWER), (_END * rho) ** (1 / _POWER), self.inner_steps)
+        sigmas = roots**_POWER
+        estimate = clean(z, sigmas[0])
+        before, earlier = estimate, 1.0
+        for now, after in pairwise(sigmas):
+            step = math.log(now / after)
+            ratio = min(step / earlier, _MAX_RATIO)
+            combined = estimate + 0.5 * ratio * (estimate - before)
+            share = (after / now) ** 2
+            noise = after * math.sqrt(1 - share) * streams.normal(*z.shape[1:])
+            z = combined + share * (z - combined) + noise
+            before, earlier = estimate, step
+            estimate = clean(z, after)
+        return estimate

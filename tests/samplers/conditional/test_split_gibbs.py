@@ -1,0 +1,117 @@
+"""Tests of the split Gibbs sampler: exact at finite coupling, its parts, wrong settings."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from probmotion import Cameras, Keypoints2D, Motion, MotionPosterior
+from probmotion.samplers.conditional import SplitGibbs, split_gibbs
+from probmotion.samplers.conditional.coupling import Coupling
+from probmotion.samplers.diffusion.guidance import LinearObservations
+from probmotion.seeds import NormalStreams
+
+DRAWS = 1500
+
+
+@pytest.fixture(scope="module")
+def keypoints(gaussian):
+    """Return keypoints of one camera, of which one is hidden."""
+    truth = Motion(gaussian.sample(np.random.default_rng(8), 1)[0], gaussian.skeleton, gaussian.fps)
+    hidden = np.zeros((1, 2, 2), dtype=bool)
+    hidden[0, 0, 1] = True
+    return Keypoints2D.observe(
+        truth, Cameras.around([0.3], [0.2]), noise=0.2, seed=0, hidden=hidden
+    )
+
+
+def assert_exact(sampler, prior, likelihood, assert_covariance):
+    mean, covariance = prior.posterior(likelihood)
+    drawn = sampler.sample(MotionPosterior(prior, likelihood), draws=DRAWS, progress=False).flat()
+    assert_covariance(drawn - mean, covariance)
+    error = abs(drawn.mean(axis=0) - mean).ravel()
+    assert (error < 5 * np.sqrt(np.diag(covariance) / DRAWS)).all()
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
+def test_draws_are_exact_at_finite_coupling(gaussian, keypoints, assert_covariance, share):
+    sampler = SplitGibbs(steps=60, sweeps=6, share=share)
+    assert_exact(sampler, gaussian, keypoints, assert_covariance)
+
+
+def test_without_subtraction_draws_are_not_exact(
+    gaussian, keypoints, assert_covariance, monkeypatch
+):
+    def unsplit(observations, rho, *, split):
+        return Coupling(observations, rho)
+
+    monkeypatch.setattr(split_gibbs, "Coupling", unsplit)
+    with pytest.raises(AssertionError):
+        assert_exact(SplitGibbs(steps=60, sweeps=6), gaussian, keypoints, assert_covariance)
+
+
+def test_reverse_diffusion_draws_from_the_conditional(gaussian, assert_covariance):
+    """X | z has the posterior of joints observed with noise ρ."""
+    rho, z = 0.4, np.random.default_rng(3).normal(size=(2, 2, 3))
+    scaled = replace(gaussian, scale=1.0)
+    precision = np.linalg.inv(scaled.covariance) + np.eye(12) / rho**2
+    covariance = np.linalg.inv(precision)
+    mean = covariance @ (
+        np.linalg.solve(scaled.covariance, scaled.mean.ravel()) + z.ravel() / rho**2
+    )
+    sampler = SplitGibbs(inner_steps=12)
+    posterior = MotionPosterior(scaled)
+    clean = sampler._pools(posterior, 5, None, rings=1)[0]
+    streams = NormalStreams([np.random.default_rng(i) for i in range(3000)])
+    drawn = sampler._reverse(clean, np.broadcast_to(z, (3000, 2, 2, 3)), rho, streams)
+    assert_covariance(drawn - mean.reshape(2, 2, 3), covariance)
+
+
+def test_scores_are_those_of_the_marginal(gaussian, keypoints):
+    """p_ρ(z) N(y; A z, σ_y² − ρ²) is Gaussian: compare with finite differences of its density."""
+    rho = 0.15
+    prior = replace(gaussian, scale=1.0)
+    observations = LinearObservations.of(SplitGibbs(), MotionPosterior(prior, keypoints))
+    clean = SplitGibbs()._pools(MotionPosterior(prior), 5, None, rings=1)[0]
+    coupling = Coupling(observations, rho, split=True)
+    wide = np.linalg.inv(prior.covariance + rho**2 * np.eye(12))
+    axes, target, precision = keypoints.linear()
+    weight = np.where(precision > 0, 1 / (keypoints.noise**2 - rho**2), 0.0)
+
+    def log_density(z):
+        deviation = (z - prior.mean).ravel()
+        residual = target - z @ axes.swapaxes(1, 2)[:, None]
+        square = (weight[..., None] * residual**2).sum()
+        return -0.5 * (deviation @ wide @ deviation + square)
+
+    z = prior.mean + np.random.default_rng(0).normal(size=prior.mean.shape)
+    score = coupling.score(z[None], clean(z[None], rho))[0]
+    for index in np.ndindex(*z.shape):
+        step = np.zeros(z.shape)
+        step[index] = 1e-5
+        slope = (log_density(z + step) - log_density(z - step)) / 2e-5
+        assert score[index] == pytest.approx(slope, rel=1e-5, abs=1e-5)
+
+
+@pytest.mark.parametrize("denoiser", ["3d", "2d"])
+def test_draws_do_not_depend_on_the_batch(gaussian, keypoints, denoiser):
+    posterior = MotionPosterior(gaussian, keypoints)
+    sampler = SplitGibbs(steps=10, sweeps=2, start_steps=4, denoiser=denoiser)
+    together = sampler.sample(posterior, draws=5, chains=2, progress=False)
+    apart = replace(sampler, batch=2).sample(posterior, draws=3, chains=2, progress=False)
+    np.testing.assert_allclose(apart.positions.values, together.positions.values[:, :3], atol=1e-9)
+    assert len(np.unique(together.flat().round(9), axis=0)) == 10
+    views = 3 if denoiser == "2d" else 1
+    assert together.counts["denoiser"] % (10 * views) == 0
+    assert together.counts["covariance"] > 0
+
+
+def test_wrong_settings():
+    with pytest.raises(ValueError, match=r"share must be below 1, as ρ must end below the noise"):
+        SplitGibbs(share=1.2)
+    with pytest.raises(ValueError, match="inner_steps must be an integer of at least 2, got 1"):
+        SplitGibbs(inner_steps=1)
+    with pytest.raises(ValueError, match="largest must be a finite number above 0, got 0"):
+        SplitGibbs(largest=0.0)
