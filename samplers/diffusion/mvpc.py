@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -83,7 +83,7 @@ class MultiViewPredictorCorrector(AncestralSampler):
     gamma: float = 0.5
     gamma_from: float = 1.0
     corrected_from: float = 1.0
-    levels: AnyLevels = Karras(smallest=0.01)
+    levels: AnyLevels = field(default_factory=partial(Karras, smallest=0.01))
     integrator: AnyIntegrator = field(default_factory=SecondOrderSDE)
     guidance: AnyGuidance = field(default_factory=MomentMatched)
     batch: int = 256
