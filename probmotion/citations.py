@@ -44,6 +44,26 @@ CITATIONS: Mapping[str, tuple[str, ...]] = {
         _SOLVER,
         _KARRAS,
     ),
+    "daps": (
+        "Zhang, Chu, Berner, Meng, Anandkumar, Song (2025). Improving diffusion inverse problem "
+        "solving with decoupled noise annealing. CVPR.",
+    ),
+    "red-diff": (
+        "Mardani, Song, Kautz, Vahdat (2024). A variational perspective on solving inverse "
+        "problems with diffusion models. ICLR.",
+    ),
+    "tds": (
+        "Wu, Trippe, Naesseth, Blei, Cunningham (2023). Practical and asymptotically exact "
+        "conditional sampling in diffusion models. NeurIPS.",
+    ),
+    "sync-tweedies": (
+        "Kim, Koo, Yeo, Sung (2024). SyncTweedies: a general generative framework based on "
+        "synchronized diffusions. NeurIPS.",
+    ),
+    "stoch-sync": (
+        "Yeo, Kim, Sung (2025). StochSync: stochastic diffusion synchronization for image "
+        "generation in arbitrary spaces. ICLR.",
+    ),
     "sds": (
         "Poole, Jain, Barron, Mildenhall (2023). DreamFusion: text-to-3D using 2D diffusion. ICLR.",
         _MAS,

@@ -14,15 +14,38 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from probmotion.comparison import compare
 from probmotion.posteriors.sampling import Sampler
 from probmotion.samplers import (
     NUTS,
+    Ancestral3D,
     Ensemble,
     MetropolisHastings,
     MultiViewAncestral,
     MultiViewPredictorCorrector,
+    SplitGibbs,
 )
+from probmotion.samplers.conditional import DAPS, REDDiff, TwistedDiffusion
+from probmotion.samplers.diffusion import (
+    DDPM,
+    DPS,
+    Cosine,
+    Heun,
+    Karras,
+    LogSNR,
+    Replacement,
+    SecondOrderSDE,
+    StochSync,
+    SyncTweedies,
+)
+
+CONDITIONED = (
+    "gait-monocular", "gait-occluded", "gait-sparse", "cmu-monocular", "quadruped-monocular",
+)  # fmt: skip
+BUDGETS = (500, 2000, 8000)
+"""Denoiser evaluations a draw."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +57,66 @@ class Study:
     samplers: Mapping[str, Sampler]
 
 
+def conditional_methods(budget: int) -> dict[str, Sampler]:
+    """Return methods of conditioning 2D denoisers, at a number of evaluations a draw."""
+    # Exact denoisers have three views at a time, those of `mas` five.
+    estimates = budget // 3
+    start = 50  # estimates of the guided start of split Gibbs, and 1.25 for each step
+    samplers: dict[str, Sampler] = {
+        "mas": MultiViewAncestral(steps=budget // 5),
+        "mas, dps": MultiViewAncestral(steps=budget // 5, guidance=DPS()),
+        "mas, replacement": MultiViewAncestral(steps=budget // 5, guidance=Replacement()),
+        "mvpc": MultiViewPredictorCorrector(steps=round(estimates / 1.63)),
+        "split-gibbs": SplitGibbs(
+            denoiser="2d", steps=max(0, round((estimates - start - 48) / 1.25))
+        ),
+        "daps": DAPS(denoiser="2d", steps=estimates // 5),
+        "red-diff": REDDiff(denoiser="2d", steps=estimates),
+        "sync-tweedies": SyncTweedies(steps=estimates),
+        "stoch-sync": StochSync(steps=estimates // 5),
+    }
+    if budget > 500:
+        particles = max(2, estimates // 50)
+        samplers["tds"] = TwistedDiffusion(denoiser="2d", particles=particles)
+    return {f"{name}, {budget}": sampler for name, sampler in samplers.items()}
+
+
 STUDIES = {
+    "integrators": Study(
+        "integrators and noise levels at 50 evaluations of a 3D denoiser",
+        ("gait", "cmu", "quadruped", "gait-monocular", "cmu-monocular"),
+        {
+            "ddpm, cosine": Ancestral3D(levels=Cosine(), integrator=DDPM()),
+            "second order, cosine": Ancestral3D(levels=Cosine()),
+            "second order, karras": Ancestral3D(levels=Karras()),
+            "second order, log-snr": Ancestral3D(),
+            "heun, log-snr": Ancestral3D(steps=25, integrator=Heun()),
+            "ddpm, log-snr": Ancestral3D(integrator=DDPM()),
+        },
+    ),
+    "elevations": Study(
+        "views of the pool: one ring at an elevation, or over the sphere",
+        ("gait", "cmu"),
+        {
+            "mas, second order": MultiViewAncestral(
+                steps=95, levels=LogSNR(), integrator=SecondOrderSDE()
+            ),
+            "mvpc, elevation 11": MultiViewPredictorCorrector(steps=58, elevation=np.pi / 16),
+            "mvpc, elevation 35": MultiViewPredictorCorrector(
+                steps=58, elevation=np.arctan(0.5**0.5)
+            ),
+            "mvpc, sphere": MultiViewPredictorCorrector(),
+        },
+    ),
+    "conditioning": Study(
+        "conditioning of 2D denoisers at equal numbers of evaluations",
+        CONDITIONED,
+        {
+            name: sampler
+            for budget in BUDGETS
+            for name, sampler in conditional_methods(budget).items()
+        },
+    ),
     "views": Study(
         "number of views, and noise shared between views",
         ("gait", "gait-monocular"),
@@ -74,15 +156,18 @@ def main() -> None:
     parser.add_argument(
         "--studies", nargs="+", choices=names, default=names, help="All by default."
     )
+    parser.add_argument("--problems", nargs="+", help="Some of each study's problems.")
+    parser.add_argument("--samplers", help="Only variants whose name contains this.")
     parser.add_argument("--draws", type=int, default=100, help="Number of draws per run.")
     parser.add_argument("--seeds", type=int, default=3, help="Number of seeds.")
     parser.add_argument("--workers", type=int, default=2, help="Number of processes.")
     options = parser.parse_args()
     for name in options.studies:
         study = STUDIES[name]
+        wanted = options.samplers or ""
         comparison = compare(
-            study.problems,
-            study.samplers,
+            [each for each in study.problems if each in (options.problems or study.problems)],
+            {each: sampler for each, sampler in study.samplers.items() if wanted in each},
             draws=options.draws,
             chains=4,
             seeds=options.seeds,
