@@ -40,7 +40,12 @@ import probmotion as pm
 from probmotion.data.synthetic.gaits import make_gaits
 from probmotion.models import GaussianMixtureMotion
 from probmotion.plots.skeletons import draw_skeletons
-from probmotion.samplers import Ancestral3D, MultiViewAncestral, MultiViewPredictorCorrector
+from probmotion.samplers import (
+    Ancestral3D,
+    MultiViewAncestral,
+    MultiViewPredictorCorrector,
+    SplitGibbs,
+)
 
 # %% [markdown]
 # ## 1. Motion files
@@ -121,11 +126,12 @@ Image("posterior.png")
 # %% [markdown]
 # All three draws agree with the observations, but differ from each other. A sampler must reproduce this spread.
 #
-# ## 4. Four samplers
+# ## 4. Five samplers
 #
 # These samplers do not use the closed form. `ancestral3d` denoises a 3D motion step by step. `mas` (multi-view
 # ancestral sampling) denoises five views at once with a 2D model. `mvpc` (multi-view predictor-corrector) adds a
-# correction after every step. `mh`, random-walk Metropolis-Hastings, requires only a density. All samplers have
+# correction after every step. `split-gibbs` alternates between prior and observations, with the same 2D model and many
+# more evaluations. `mh`, random-walk Metropolis-Hastings, requires only a density. All samplers have
 # the same method `sample`:
 
 # %%
@@ -142,9 +148,10 @@ comparison = pm.compare(
     {"one camera": posterior},
     {
         "exact": "exact",
-        "ancestral3d": Ancestral3D(steps=50),
+        "ancestral3d": Ancestral3D(),
         "mas": MultiViewAncestral(steps=50),
-        "mvpc": MultiViewPredictorCorrector(steps=25),
+        "mvpc": MultiViewPredictorCorrector(steps=51),
+        "split-gibbs": SplitGibbs(denoiser="2d"),
         "mh": "mh",
     },
     draws=48,
@@ -173,11 +180,13 @@ comparison.plot("quality.png")
 Image("quality.png")
 
 # %% [markdown]
-# - `ancestral3d` is close to the posterior, but its motions are too smooth: 50 first-order steps do not reach the
-#   smallest variance (`off_manifold_ratio` far below 1). More steps reduce this error.
-# - `mas` has about twice the correct variance: it guides each view separately, which weakens the effect of the
-#   observations on the other views.
-# - `mvpc` has a smaller error at the same number of denoiser evaluations, but its variance is still too large.
+# - `ancestral3d` has the correct variance off the manifold, but draws the two styles in wrong proportions
+#   (`mode_proportions_tv`): guidance finds motions that agree with the observations in each style, and does not know
+#   how likely the observations are in it.
+# - `mas` adds errors of single views: its variance is almost twice the correct one.
+# - `mvpc` has a smaller error at the same number of denoiser evaluations, since its views cover the sphere.
+# - `split-gibbs` is exact within a style, but starts from guided draws and does not change their style. Where the
+#   observations leave one mode, as in the problem `gait-monocular`, it is right.
 # - `mh` is as close as exact draws, but its chains have not converged (R-hat far above 1.01, few effective
 #   draws). It also requires a log density, which a learnt 2D model does not have.
 #
