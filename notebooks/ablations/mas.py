@@ -205,6 +205,11 @@ class Study:
         )
 
 
+ACCURATE = replace(
+    MultiViewPredictorCorrector.learnt(), steps=100, corrector_steps=2, corrector_size=0.4
+)
+
+
 def samplers(iterations: int) -> dict[str, Sampler]:
     """Return the samplers of table 2 and additional variants."""
     return {
@@ -212,8 +217,8 @@ def samplers(iterations: int) -> dict[str, Sampler]:
         "MAS, orthographic": MultiViewAncestral(),
         "MAS, 2 views": MultiViewAncestral(n_views=2, perspective=True),
         "MAS, no 3D noise": MultiViewAncestral(perspective=True, shared_noise=False),
-        "mvpc": MultiViewPredictorCorrector(),
-        "mvpc, accurate": MultiViewPredictorCorrector.accurate(),
+        "mvpc": MultiViewPredictorCorrector.learnt(),
+        "mvpc, accurate": ACCURATE,
         "SDS, uniform": ScoreDistillation(iterations=iterations),
         "SDS, annealed": ScoreDistillation(iterations=iterations, levels="annealed"),
     }
@@ -410,7 +415,7 @@ def strided(study: Study) -> pd.DataFrame:
     for steps in (10, 20, 50, 100):
         fewer = {"steps": steps, "levels": Cosine(trained_steps=100)}
         variants[steps, "MAS"] = MultiViewAncestral(**fewer, perspective=True)
-        variants[steps, "mvpc"] = MultiViewPredictorCorrector(**fewer)
+        variants[steps, "mvpc"] = replace(MultiViewPredictorCorrector.learnt(), **fewer)
     labelled = {f"{name}, {steps} steps": sampler for (steps, name), sampler in variants.items()}
     comparison = study.compared("strided", {"walks": study.problem}, labelled)
     rows = []
@@ -449,8 +454,8 @@ def exact(study: Study) -> pd.DataFrame:
         {"exact": problem, "network": MotionPosterior(learnt)},
         {
             "mas": MultiViewAncestral(),
-            "mvpc": MultiViewPredictorCorrector(),
-            "mvpc, accurate": MultiViewPredictorCorrector.accurate(),
+            "mvpc": MultiViewPredictorCorrector.learnt(),
+            "mvpc, accurate": ACCURATE,
         },
     )
     metrics = (

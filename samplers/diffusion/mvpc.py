@@ -29,8 +29,8 @@ from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.protocols import Denoises2D
 from probmotion.samplers.diffusion.ancestral import AncestralSampler
 from probmotion.samplers.diffusion.guidance import AnyGuidance, MomentMatched, guide_towards
-from probmotion.samplers.diffusion.integrators import AnyIntegrator, SecondOrderSDE
-from probmotion.samplers.diffusion.noise_levels import AnyLevels, Karras
+from probmotion.samplers.diffusion.integrators import DDPM, AnyIntegrator, SecondOrderSDE
+from probmotion.samplers.diffusion.noise_levels import AnyLevels, Cosine, Karras
 from probmotion.samplers.diffusion.states import MotionState, State
 from probmotion.samplers.diffusion.views import Views, pools, symmetric_power, view_sets
 from probmotion.seeds import NormalStreams
@@ -104,6 +104,22 @@ class MultiViewPredictorCorrector(AncestralSampler):
     def accurate(cls) -> MultiViewPredictorCorrector:
         """Return a sampler with a smaller error at three times the default cost."""
         return cls(steps=200, corrector_steps=2, corrector_size=0.4)
+
+    @classmethod
+    def learnt(cls) -> MultiViewPredictorCorrector:
+        """Return a sampler for learnt denoisers, with first-order steps through their levels.
+
+        Networks err most at low noise, where the defaults, which suit exact denoisers, have most of
+        their levels.
+        """
+        return cls(
+            steps=50,
+            levels=Cosine(),
+            integrator=DDPM(),
+            corrector_size=0.5,
+            gamma_from=0.5,
+            corrected_from=0.15,
+        )
 
     def gamma_at(self, level: float) -> float:
         """Return γ at a noise level σ."""

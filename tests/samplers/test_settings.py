@@ -90,6 +90,7 @@ def test_presets():
     assert MultiViewPredictorCorrector.accurate() == MultiViewPredictorCorrector(
         steps=200, corrector_steps=2, corrector_size=0.4
     )
+    assert MultiViewPredictorCorrector.learnt().levels == Cosine()
     assert ScoreDistillation.reference_code() == ScoreDistillation(
         iterations=1000, weighting="residual", arc=1.0, schedule_power=4
     )

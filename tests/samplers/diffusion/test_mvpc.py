@@ -34,6 +34,13 @@ def test_mvpc_without_gamma_and_corrector_equals_mas(gaussian):
     assert mvpc.counts == mas.counts
 
 
+def test_first_order_preset(gaussian):
+    """Its 50 levels and 45 corrector steps of five views cost as much as MAS."""
+    sampler = replace(MultiViewPredictorCorrector.learnt(), elevation=0.2)
+    draws = sampler.sample(MotionPosterior(gaussian), draws=2, progress=False)
+    assert draws.counts == {"denoiser": 2 * 475}
+
+
 @pytest.mark.parametrize(
     ("settings", "calls"), [({}, 3 * 158), ({"elevation": 0.2, "corrector_steps": 3}, 5 * 280)]
 )
