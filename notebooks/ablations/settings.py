@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -106,6 +106,23 @@ STUDIES = {
                 steps=58, elevation=np.arctan(0.5**0.5)
             ),
             "mvpc, sphere": MultiViewPredictorCorrector(),
+        },
+    ),
+    "network": Study(
+        "integrators and levels on a network",
+        ("walk2d",),
+        {
+            "mas": MultiViewAncestral(),
+            "mas, 20 second-order levels": MultiViewAncestral(
+                steps=20, levels=Cosine(trained_steps=100), integrator=SecondOrderSDE()
+            ),
+            "mvpc, learnt": MultiViewPredictorCorrector.learnt(),
+            "mvpc, second order": replace(
+                MultiViewPredictorCorrector.learnt(),
+                levels=Cosine(trained_steps=100),
+                integrator=SecondOrderSDE(),
+            ),
+            "mvpc, 58 levels": MultiViewPredictorCorrector(steps=58),
         },
     ),
     "conditioning": Study(

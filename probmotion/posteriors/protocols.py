@@ -187,7 +187,11 @@ class HasManifold(Protocol):
 
 @runtime_checkable
 class Denoises2D(Protocol):
-    """2D denoiser: posterior mean of clean views given noisy views."""
+    """2D denoiser: posterior mean of clean views given noisy views.
+
+    A learnt denoiser should have the attribute ``view_elevation``, the elevation of its training
+    views in radians; without it, samplers also use views from above, as for exact denoisers.
+    """
 
     @property
     def scale(self) -> float:

@@ -75,10 +75,19 @@ class ConditionalSampler(IndependentSampler):
                 word="no observations",
                 others=suited(posterior),
             )
-        return LinearObservations.of(self, posterior)
+        observations = LinearObservations.of(self, posterior)
+        if not observations.precision.any():
+            raise ValueError(
+                "likelihood must contain an observed entry, got none; sample the prior instead"
+            )
+        return observations
 
     def _pools(
-        self, posterior: MotionPosterior, n_views: int, elevation: float | None, rings: int
+        self,
+        posterior: MotionPosterior,
+        n_views: int = 5,
+        elevation: float | None = None,
+        rings: int = 1,
     ) -> list[VarianceExploding]:
         """Return the 3D denoiser, or one pool of 2D denoisers for each set of views."""
         prior = posterior.prior
@@ -103,16 +112,13 @@ class AnnealedSampler(NoiseLevels, ConditionalSampler):
     With a 2D denoiser, levels alternate between pools of views as in ``mvpc``.
     """
 
-    n_views: int
-    elevation: float | None
-
     def __post_init__(self) -> None:
         NoiseLevels.__post_init__(self)
         ConditionalSampler.__post_init__(self)
 
     def _batches(self, posterior: MotionPosterior, seed: int, progress: bool) -> Batches:
         observations = self._observations(posterior)
-        pools = self._pools(posterior, self.n_views, self.elevation, rings=1)
+        pools = self._pools(posterior)
         shape = (posterior.frames, posterior.skeleton.n_joints, 3)
         sigmas = np.array([self.schedule.sigma(t) for t in range(self.steps, 0, -1)])
 

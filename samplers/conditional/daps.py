@@ -41,11 +41,6 @@ class DAPS(AnnealedSampler):
         Spacing of the noise levels.
     denoiser : {"any", "3d", "2d"}
         Kind of denoiser; "any" is the 3D denoiser if the prior has one.
-    n_views : int
-        Number of views of learnt denoisers, evenly spaced in azimuth.
-    elevation : float, optional
-        Elevation of these views, radians; by default that of the prior's training. Exact denoisers
-        hold for any view, and by default alternate between five sets of three orthogonal views.
     batch : int
         Maximum batch size; does not affect the draws.
     """
@@ -56,8 +51,6 @@ class DAPS(AnnealedSampler):
     ode_steps: int = 5
     levels: AnyLevels = field(default_factory=Karras)
     denoiser: DenoiserChoice = "any"
-    n_views: int = 5
-    elevation: float | None = None
     batch: int = 256
 
     def __post_init__(self) -> None:

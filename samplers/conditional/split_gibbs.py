@@ -15,7 +15,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any, ClassVar
 
 import numpy as np
@@ -27,11 +26,14 @@ from probmotion.samplers.conditional.base import (
     VarianceExploding,
 )
 from probmotion.samplers.conditional.coupling import Coupling, times
-from probmotion.samplers.diffusion.ancestral import AncestralSampler
+from probmotion.samplers.diffusion.ancestral import AncestralSampler, reverse_diffusion
 from probmotion.samplers.diffusion.ancestral3d import Ancestral3D
 from probmotion.samplers.diffusion.guidance import LinearObservations
+from probmotion.samplers.diffusion.integrators import SecondOrderSDE
 from probmotion.samplers.diffusion.mvpc import MultiViewPredictorCorrector
 from probmotion.samplers.diffusion.noise_levels import Karras
+from probmotion.samplers.diffusion.states import MotionState
+from probmotion.samplers.diffusion.views import MotionDenoiser
 from probmotion.samplers.independent import Batches
 from probmotion.seeds import NormalStreams
 from probmotion.validation import check_count, check_positive
@@ -44,7 +46,6 @@ _ANNEALED_TO = 0.7  # last ρ of the Langevin dynamics, in σ_y
 _STEP, _FRICTION = 0.7, 0.2  # of the Langevin dynamics, in units of the coupling's deviations
 _END = 0.1  # last noise level of the reverse diffusion, in ρ
 _POWER = 5  # of its spacing (Karras et al. 2022, equation 5)
-_MAX_RATIO = 2.0  # of consecutive steps in the extrapolation of estimates
 
 
 @dataclass(frozen=True)
@@ -103,9 +104,9 @@ class SplitGibbs(ConditionalSampler):
                 f"{self.share}; use .95"
             )
 
-    def _start(self, three_dimensional: bool) -> AncestralSampler:
+    def _start(self, in_3d: bool) -> AncestralSampler:
         """Return the guided sampler of the starting points."""
-        if three_dimensional:
+        if in_3d:
             return Ancestral3D(steps=self.start_steps, levels=Karras(smallest=0.04))
         return MultiViewPredictorCorrector(
             steps=self.start_steps,
@@ -119,8 +120,10 @@ class SplitGibbs(ConditionalSampler):
 
     def _batches(self, posterior: MotionPosterior, seed: int, progress: bool) -> Batches:
         observations = self._observations(posterior)
-        pools = self._pools(posterior, self.n_views, self.elevation, _RINGS)
-        start = self._start(len(pools) == 1)._batches(posterior, seed, progress)
+        pools = self._pools(posterior, self.n_views, self.elevation, rings=_RINGS)
+        start = self._start(isinstance(pools[0].denoiser, MotionDenoiser))._batches(
+            posterior, seed, progress
+        )
         sources = [start.counts, pools[0].denoiser.counts]
         counts = {"denoiser": 0}
 
@@ -201,18 +204,8 @@ class SplitGibbs(ConditionalSampler):
     def _reverse(
         self, clean: VarianceExploding, z: np.ndarray, rho: float, streams: NormalStreams
     ) -> np.ndarray:
-        """Return a draw of x | z: second-order reverse diffusion from σ = ρ (Lu et al. 2022)."""
-        roots = np.linspace(rho ** (1 / _POWER), (_END * rho) ** (1 / _POWER), self.inner_steps)
-        sigmas = roots**_POWER
-        estimate = clean(z, sigmas[0])
-        before, earlier = estimate, 1.0
-        for now, after in pairwise(sigmas):
-            step = math.log(now / after)
-            ratio = min(step / earlier, _MAX_RATIO)
-            combined = estimate + 0.5 * ratio * (estimate - before)
-            share = (after / now) ** 2
-            noise = after * math.sqrt(1 - share) * streams.normal(*z.shape[1:])
-            z = combined + share * (z - combined) + noise
-            before, earlier = estimate, step
-            estimate = clean(z, after)
-        return estimate
+        """Return a draw of x | z by second-order reverse diffusion from σ = ρ."""
+        schedule = Karras(_END * rho, rho, _POWER).schedule(self.inner_steps)
+        state = MotionState([clean.denoiser], schedule, z.shape[1:])
+        x = math.sqrt(schedule.alpha_bar[-1]) * z
+        return reverse_diffusion(state, streams, x, lambda: None, SecondOrderSDE())

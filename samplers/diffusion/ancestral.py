@@ -20,7 +20,7 @@ from probmotion.samplers.diffusion.states import State
 from probmotion.samplers.independent import Batches, IndependentSampler
 from probmotion.seeds import NormalStreams
 
-__all__ = ["AncestralSampler", "Corrector", "ancestral"]
+__all__ = ["AncestralSampler", "Corrector", "ancestral", "reverse_diffusion"]
 
 
 Corrector = Callable[[State, NormalStreams, np.ndarray, int], np.ndarray]
@@ -37,16 +37,36 @@ def ancestral(
     corrector: Corrector | None = None,
     watch: Callable[[Transition | None, np.ndarray], None] | None = None,
 ) -> np.ndarray:
-    """Return one motion per stream, (B, L, J, 3): the estimate at level ``stop``.
+    """Return one motion per stream, (B, L, J, 3), from noise at level T.
 
-    ``tick`` is called after every level. ``corrector`` is applied to every new state. ``watch`` is
-    called with (None, initial noise), then with the transition and the unit noise of every step.
+    Arguments are those of :func:`reverse_diffusion`; ``watch`` is first called with (None, initial
+    noise).
     """
-    schedule = state.schedule
-    x = state.noise(streams, schedule.steps)
+    x = state.noise(streams, state.schedule.steps)
     if watch is not None:
         watch(None, x)
-    before = None
+    return reverse_diffusion(
+        state, streams, x, tick, integrator, stop=stop, corrector=corrector, watch=watch
+    )
+
+
+def reverse_diffusion(
+    state: State,
+    streams: NormalStreams,
+    x: np.ndarray,
+    tick: Callable[[], Any],
+    integrator: AnyIntegrator,
+    *,
+    stop: int = 1,
+    corrector: Corrector | None = None,
+    watch: Callable[[Transition | None, np.ndarray], None] | None = None,
+) -> np.ndarray:
+    """Return the estimate at level ``stop``, (B, L, J, 3), from the state ``x`` at level T.
+
+    ``tick`` is called after every level. ``corrector`` is applied to every new state. ``watch`` is
+    called with the transition and the unit noise of every step.
+    """
+    schedule, before = state.schedule, None
     for t in range(schedule.steps, stop, -1):
         step = integrator.transition(state, x, t, before)
         before = step.estimate

@@ -26,7 +26,7 @@ from probmotion.validation import check_count
 
 __all__ = ["StochSync"]
 
-_RINGS = 5  # of views of learnt denoisers
+_VIEWS, _RINGS = 3, 5  # views and alternating rings of learnt denoisers
 
 
 @dataclass(frozen=True)
@@ -42,11 +42,6 @@ class StochSync(NoiseLevels, IndependentSampler):
         Number of noise levels T.
     ode_steps : int
         Number of DDIM steps of a view at each level.
-    n_views : int
-        Number of views of learnt denoisers, evenly spaced in azimuth.
-    elevation : float, optional
-        Elevation of these views, radians; by default that of the prior's training. Exact denoisers
-        hold for any view, and by default alternate between five sets of three orthogonal views.
     levels : AnyLevels
         Spacing of the noise levels.
     guidance : WeightedTriangulation or Replacement
@@ -63,8 +58,6 @@ class StochSync(NoiseLevels, IndependentSampler):
 
     steps: int = 40
     ode_steps: int = 5
-    n_views: int = 3
-    elevation: float | None = None
     levels: AnyLevels = field(default_factory=Karras)
     guidance: WeightedTriangulation | Replacement = field(default_factory=WeightedTriangulation)
     batch: int = 256
@@ -72,12 +65,11 @@ class StochSync(NoiseLevels, IndependentSampler):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_count("ode_steps", self.ode_steps)
-        check_count("n_views", self.n_views, least=3)
 
     def _batches(self, posterior: MotionPosterior, seed: int, progress: bool) -> Batches:
         prior, schedule, counts = posterior.prior, self.schedule, {"denoiser": 0}
         assert isinstance(prior, Denoises2D)
-        sets = view_sets(prior, self.n_views, self.elevation, rings=_RINGS)
+        sets = view_sets(prior, _VIEWS, None, rings=_RINGS)
         guide = guide_towards(self, posterior, self.guidance, MultiViewDenoiser(prior, sets[0]))
         shape = (posterior.frames, posterior.skeleton.n_joints, 3)
 

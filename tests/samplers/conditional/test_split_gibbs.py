@@ -63,7 +63,7 @@ def test_reverse_diffusion_draws_from_the_conditional(gaussian, assert_covarianc
     )
     sampler = SplitGibbs(inner_steps=12)
     posterior = MotionPosterior(scaled)
-    clean = sampler._pools(posterior, 5, None, rings=1)[0]
+    clean = sampler._pools(posterior)[0]
     streams = NormalStreams([np.random.default_rng(i) for i in range(3000)])
     drawn = sampler._reverse(clean, np.broadcast_to(z, (3000, 2, 2, 3)), rho, streams)
     assert_covariance(drawn - mean.reshape(2, 2, 3), covariance)
@@ -74,7 +74,7 @@ def test_scores_are_those_of_the_marginal(gaussian, keypoints):
     rho = 0.15
     prior = replace(gaussian, scale=1.0)
     observations = LinearObservations.of(SplitGibbs(), MotionPosterior(prior, keypoints))
-    clean = SplitGibbs()._pools(MotionPosterior(prior), 5, None, rings=1)[0]
+    clean = SplitGibbs()._pools(MotionPosterior(prior))[0]
     coupling = Coupling(observations, rho, split=True)
     wide = np.linalg.inv(prior.covariance + rho**2 * np.eye(12))
     axes, target, precision = keypoints.linear()
@@ -106,6 +106,12 @@ def test_draws_do_not_depend_on_the_batch(gaussian, keypoints, denoiser):
     views = 3 if denoiser == "2d" else 1
     assert together.counts["denoiser"] % (10 * views) == 0
     assert together.counts["covariance"] > 0
+
+
+def test_nothing_observed(gaussian, keypoints):
+    blank = replace(keypoints, confidence=np.zeros((1, 2, 2)))
+    with pytest.raises(ValueError, match="likelihood must contain an observed entry, got none"):
+        SplitGibbs().sample(MotionPosterior(gaussian, blank), draws=1, progress=False)
 
 
 def test_wrong_settings():
