@@ -81,11 +81,14 @@ class RotatedSpectra:
         self.shape = (K, S, len(azimuths))
         self.frames, self.n_joints = L, P // 3
         self._means = (means[:, :, None] @ directions[:, band])[:, :, 0]
+        # Resampled priors have no frequency in some bands.
+        used, band = np.unique(band, return_inverse=True)
+        directions = directions[:, used]
         self._spectra = spectra
         self._log_weights = log_weights - math.log(len(azimuths))
         # Rows of the x and z coordinates, and of the y coordinates.
         parts = (directions[:, :, 0::3], directions[:, :, 2::3])
-        self._ground = np.concatenate(parts, axis=2)
+        self._ground = np.ascontiguousarray(np.concatenate(parts, axis=2))
         self._height = np.ascontiguousarray(directions[:, :, 1::3])
         self._transposed = tuple(
             np.ascontiguousarray(part.swapaxes(2, 3)) for part in (self._ground, self._height)

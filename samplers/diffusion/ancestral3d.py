@@ -27,7 +27,8 @@ class Ancestral3D(AncestralSampler):
     Parameters
     ----------
     steps : int
-        Number of denoising steps T.
+        Number of denoising steps T. With fewer than about 30, second-order steps overshoot, and the
+        variance is too large.
     levels : AnyLevels
         Spacing of the noise levels.
     integrator : AnyIntegrator

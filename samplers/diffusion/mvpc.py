@@ -46,7 +46,8 @@ class MultiViewPredictorCorrector(AncestralSampler):
     Parameters
     ----------
     steps : int
-        Number of noise levels T.
+        Number of noise levels T. With fewer than about 30, second-order steps overshoot, and the
+        variance is too large.
     corrector_steps : int
         Number of corrector steps per level.
     corrector_size : float
