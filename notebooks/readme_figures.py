@@ -18,7 +18,7 @@ from probmotion.problems import load_problem
 
 ROOT = Path(__file__).parents[1]
 FIGURES = ROOT / "notebooks" / "pictures"
-SHOWN = ("exact", "mas", "mvpc", "nuts")
+SHOWN = ("exact", "nuts", "mh", "mas")
 
 
 def save_small(path: Path) -> None:

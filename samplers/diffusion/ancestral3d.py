@@ -41,6 +41,7 @@ class Ancestral3D(AncestralSampler):
 
     name: ClassVar[str] = "ancestral3d"
     requires: ClassVar[tuple[type, ...]] = (Denoises3D,)
+    least_effort: ClassVar[int] = 30
 
     steps: int = 50
     levels: AnyLevels = field(default_factory=LogSNR)

@@ -75,6 +75,7 @@ class MultiViewPredictorCorrector(AncestralSampler):
 
     name: ClassVar[str] = "mvpc"
     requires: ClassVar[tuple[type, ...]] = (Denoises2D,)
+    least_effort: ClassVar[int] = 30
 
     steps: int = 97
     corrector_steps: int = 1
