@@ -20,12 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from probmotion.arrays import Array, array_namespace, constant, logsumexp
-from probmotion.models.mixture._spectral_kernels import (
-    combine,
-    cross_products,
-    from_bases,
-    to_bases,
-)
+from probmotion.models.mixture._spectral_kernels import cross_products, from_bases, to_bases
 from probmotion.models.mixture.rotated_mixture import rotation_coefficients
 
 __all__ = ["RotatedSpectra", "blocks"]
@@ -34,6 +29,7 @@ _BLOCK = 16
 """Points per block, so that products fit into a core's cache. The last block is padded with zeros:
 rounding of a point must not depend on the batch size."""
 _NEGLIGIBLE = 1e-16  # responsibilities below are set to 0
+_Bases = tuple[np.ndarray, np.ndarray]  # products on the ground and in height
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # entries of a symmetric 3×3 matrix
 
 
@@ -90,13 +86,20 @@ class RotatedSpectra:
         parts = (directions[:, :, 0::3], directions[:, :, 2::3])
         self._ground = np.ascontiguousarray(np.concatenate(parts, axis=2))
         self._height = np.ascontiguousarray(directions[:, :, 1::3])
-        self._transposed = tuple(
-            np.ascontiguousarray(part.swapaxes(2, 3)) for part in (self._ground, self._height)
-        )
+        along, up = self._ground.swapaxes(2, 3), self._height.swapaxes(2, 3)
+        J = self.n_joints
+        turned = np.concatenate([along[..., J:], -along[..., :J]], axis=3)
+        both = np.concatenate([along, turned], axis=2)
+        self._transposed = np.ascontiguousarray(both), np.ascontiguousarray(up)
         self._edges = np.flatnonzero(np.diff(band, prepend=-1, append=-1))
         self._bands = [
             (int(band[start]), int(start), int(stop)) for start, stop in pairwise(self._edges)
         ]
+        # Indices of a block's frequencies in the order of the bases' rows, and of the pairs.
+        index = np.arange(_BLOCK * L).reshape(_BLOCK, L)
+        parts = [index[:, start:stop].ravel() for _, start, stop in self._bands]
+        self._order = np.concatenate(parts)
+        self._twice = np.concatenate([2 * part + i for part in parts for i in range(2)])
         to_world = rotation_coefficients(azimuths)  # (A, 3)
         to_canonical = to_world * [1.0, -1.0, 1.0]
         # Quadratic forms in (cos ψ, −sin ψ, 1) as products with their coefficients.
@@ -150,8 +153,12 @@ class RotatedSpectra:
 
     def log_evidence(self, y: np.ndarray, variance: float) -> np.ndarray:
         """Return log p(k, s, a, y) up to a constant: ``(n, L, J, 3) → (n, K, S, A)``."""
-        bases = self._bases(y, self._means, self._space(len(y)))
-        return self._logits(bases, self._level(variance))
+        out = np.empty((len(y), *self.shape))
+        level, bases = self._level(variance), self._space()
+        for rows, block in blocks(y):
+            logits = self._logits(self._bases(block, self._means, bases), level)
+            out[rows] = logits[: rows.stop - rows.start]
+        return out
 
     def log_density(self, x: Array) -> Array:
         """Return log p(X): ``(n, L, J, 3) → (n,)``; NumPy, torch or JAX."""
@@ -189,45 +196,38 @@ class RotatedSpectra:
             level = self._last = _Level(variance, precision, offsets)
         return level
 
-    def _space(self, n: int = _BLOCK) -> np.ndarray:
-        """Return an array for the bases of n points; memory is slow at first use."""
-        return np.empty((self.shape[0], 3, n * self.frames, 3 * self.n_joints))
+    def _space(self) -> _Bases:
+        """Return arrays for the bases of a block; memory is slow at first use."""
+        K, rows, P = self.shape[0], _BLOCK * self.frames, 3 * self.n_joints
+        return np.empty((K, 2 * rows, P)), np.empty((K, rows, P))
 
-    def _bases(self, y: np.ndarray, means: np.ndarray, out: np.ndarray) -> np.ndarray:
-        """Return V_kᵀ (E_i y − δ_i3 m_k) for the three base rotations E_i, (K, 3, n L, P).
+    def _bases(self, y: np.ndarray, means: np.ndarray, out: _Bases) -> _Bases:
+        """Return V_kᵀ (E_i y − δ_i3 m_k) for the three base rotations E_i.
 
-        Rows are ordered by band, then point, then frequency.
+        Rows are ordered as in :mod:`~probmotion.models.mixture._spectral_kernels`.
         """
-        ordered = y.reshape(-1, self.n_joints, 3)[self._order(len(y))]
-        x, height, z = (np.ascontiguousarray(ordered[..., i]) for i in range(3))
-        ground = np.stack([np.concatenate([x, z], axis=1), np.concatenate([z, -x], axis=1)])
-        for k, mean in enumerate(means):
-            to_bases(ground, height, self._ground[k], self._height[k], mean, self._edges, out[k])
+        rows = y.reshape(-1, self.n_joints, 3)
+        x, height, z = (rows[..., i] for i in range(3))
+        both = np.concatenate([x, z, z, -x], axis=1).reshape(2 * len(rows), -1)
+        motions = both[self._twice], height[self._order]
+        to_bases(motions, (self._ground, self._height), means, self._edges, out)
         return out
 
-    def _order(self, n: int) -> np.ndarray:
-        """Return the indices of n L frequencies by band, then point, then frequency."""
-        index = np.arange(n * self.frames).reshape(n, -1)
-        bands = pairwise(self._edges)
-        return np.concatenate([index[:, start:stop].ravel() for start, stop in bands])
-
-    def _products(self, left: np.ndarray, right: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    def _products(self, left: _Bases, right: _Bases, weights: np.ndarray) -> np.ndarray:
         """Return Σ w l r at each azimuth, for weights w (K, S, L, P), (n, K, S, A)."""
         K, S, _ = self.shape
-        out = np.empty((K, left.shape[2] // self.frames, S, 9))
-        for k in range(K):
-            cross_products(left[k], right[k], weights[k], self._edges, out[k])
-        products = out.swapaxes(0, 1).reshape(-1, K * S, 9) @ self._squares
-        return products.reshape(-1, *self.shape)
+        out = np.empty((left[1].shape[1] // self.frames, K, S, 9))
+        cross_products(left, right, weights, self._edges, out)
+        return (out.reshape(-1, K * S, 9) @ self._squares).reshape(-1, *self.shape)
 
-    def _logits(self, bases: np.ndarray, level: _Level) -> np.ndarray:
+    def _logits(self, bases: _Bases, level: _Level) -> np.ndarray:
         """Return log p(k, s, a, y) up to a constant, (n, K, S, A)."""
         logits = self._products(bases, bases, level.precision)
         logits *= -0.5
         logits += level.offsets[..., None]
         return logits
 
-    def _responsibilities(self, bases: np.ndarray, level: _Level) -> np.ndarray:
+    def _responsibilities(self, bases: _Bases, level: _Level) -> np.ndarray:
         """Return p(k, s, a | y), (n, K, S, A)."""
         weights = self._logits(bases, level)
         weights -= weights.max(axis=(1, 2, 3), keepdims=True)
@@ -236,26 +236,16 @@ class RotatedSpectra:
         weights[weights < _NEGLIGIBLE] = 0.0
         return weights
 
-    def _weighted(self, bases: np.ndarray, factors: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Return Σ_ksa w R(ψ_a) V_k f V_kᵀ R(ψ_a)ᵀ (y − R(ψ_a) m_k), (n, L, J, 3).
-
-        Overwrites the bases of y − m.
-        """
+    def _weighted(self, bases: _Bases, factors: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Return Σ_ksa w R(ψ_a) V_k f V_kᵀ R(ψ_a)ᵀ (y − R(ψ_a) m_k), (n, L, J, 3)."""
         n, L, J = len(weights), self.frames, self.n_joints
         # Σ_a w c_i(ψ_a) c_j(−ψ_a) with c = (cos, sin, 1).
         sums = weights.reshape(n, -1, weights.shape[3]) @ self._both
         sums = sums.reshape(*weights.shape[:3], 3, 3)
-        ground, height = np.zeros((2, n * L, 2 * J)), np.zeros((n * L, J))
-        for k in range(self.shape[0]):
-            own = np.ascontiguousarray(sums[:, k])
-            if own.any():
-                combine(bases[k], factors[k], own, self._edges)
-                along, up = (part[k] for part in self._transposed)
-                from_bases(bases[k], along, up, self._edges, ground, height)
-        straight, turned = ground
-        x, z = straight[:, :J] + turned[:, J:], straight[:, J:] - turned[:, :J]
+        ground, height = np.zeros((n * L, 2 * J)), np.zeros((n * L, J))
+        from_bases(bases, factors, sums, self._transposed, self._edges, (ground, height))
         out = np.empty((n * L, J, 3))
-        out[self._order(n)] = np.stack([x, height, z], axis=-1)
+        out[self._order] = np.stack([ground[:, :J], height, ground[:, J:]], axis=-1)
         return out.reshape(n, L, J, 3)
 
 
