@@ -3,6 +3,8 @@
 Prints ``name: value`` lines. ``diffusion``: metrics of 400 draws (split Gibbs: 200, with five 2D
 views), mean over seeds.
 
+``lift``: see ``lift_figures.py``.
+
 ``exact-priors``: coverages are mean distances from held-out pose pairs to the nearest lifted
 annotation in interaction coordinates, metres (:func:`probmotion.metrics.coverage.coverage`);
 ``salsa_lift_mm`` is the rms error of lifted joints after rigid alignment; ``completion_m`` is the
@@ -23,6 +25,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from lift_figures import lift_figures
 
 from probmotion import compare, seeds
 from probmotion.data.denoising_clips import denoising_clips
@@ -388,7 +391,13 @@ def main() -> None:
     )
     command.add_argument("--held-out", nargs="*", default=SALSA_HELD_OUT, help="Salsa clips.")
     commands.add_parser("diffusion", help="Diffusion samplers against exact posteriors.")
+    command = commands.add_parser("lift", help="Lifts of made videos of held-out clips.")
+    command.add_argument("--data", required=True, help="Folder with the real motions.")
     options = parser.parse_args()
+    if options.command == "lift":
+        for name, value in lift_figures(Path(options.data)):
+            print(f"{name}: {value:.4g}", flush=True)
+        return
     if options.command == "diffusion":
         for name, value in diffusion_figures():
             print(f"{name}: {value:.4g}", flush=True)

@@ -1,11 +1,13 @@
 """Cost of MAS with a network of the published size: V = 5, L = 180, J = 16, 100 steps.
 
 Perspective views, one motion, untrained weights. ``outside_network_share``: fraction of the time
-outside the network's forward passes. ``network_gflops_share``: its floating-point rate over that
+outside the network's forward passes, with DDPM steps; ``outside_network_share_NAME`` with the other
+integrators, 20 steps. ``network_gflops_share``: its floating-point rate over that
 of a large float32 matrix product in the same run, on the same threads. ``memory_gib``: peak
 memory of a separate process. ``strided_20_fid_ratio``: FID with 20 steps over that with 100,
 prior walk2d, 256 motions each; ``strided_20_fid_gap``: their difference over the standard
-deviation of ten repeats. With CUDA also motions per second, 64 at a time.
+deviation of ten repeats. ``split_gibbs_evaluations_per_draw``: evaluations of the 2D denoiser by
+``split-gibbs`` on gait-monocular. With CUDA also motions per second, 64 at a time.
 """
 
 from __future__ import annotations
@@ -34,10 +36,19 @@ from probmotion.models.diffusion.settings import DiffusionSettings
 from probmotion.models.training.standardisation import Standards
 from probmotion.motion.skeleton import Skeleton
 from probmotion.problems import load_problem
-from probmotion.samplers import MultiViewAncestral
+from probmotion.samplers import MultiViewAncestral, SplitGibbs
+from probmotion.samplers.diffusion.integrators import (
+    DDIM,
+    DDPM,
+    AnyIntegrator,
+    Heun,
+    SecondOrderSDE,
+)
 from probmotion.samplers.diffusion.noise_levels import Cosine
 
 FRAMES, JOINTS, VIEWS = 180, 16, 5
+PUBLISHED = DDPM()
+OTHERS = DDIM(), SecondOrderSDE(), Heun()
 
 
 def paper_prior(device: str = "cpu") -> tuple[MotionDiffusion, torch.nn.Module]:
@@ -76,9 +87,13 @@ class Timer:
         return time.perf_counter()
 
 
-def run(prior: MotionDiffusion, draws: int, steps: int = 100) -> float:
+def run(
+    prior: MotionDiffusion, draws: int, steps: int = 100, integrator: AnyIntegrator = PUBLISHED
+) -> float:
     """Return the duration of MAS in seconds."""
-    sampler = MultiViewAncestral(steps=steps, n_views=VIEWS, perspective=True)
+    sampler = MultiViewAncestral(
+        steps=steps, n_views=VIEWS, perspective=True, integrator=integrator
+    )
     start = time.perf_counter()
     sampler.sample(MotionPosterior(prior), draws=draws, progress=False)
     return time.perf_counter() - start
@@ -121,13 +136,26 @@ def on_cpu(steps: int = 100) -> dict[str, float]:
     seconds = run(prior, draws=1, steps=steps)
     rate = (before + matmul_gflops()) / 2
     # Medians are robust to temporary load from other processes.
-    return {
+    measurements = {
         "outside_network_share": 1 - sum(timer.seconds) / seconds,
         "network_gflops_share": gflop / statistics.median(timer.seconds) / rate,
         "step_milliseconds": 1000 * seconds / steps,
         "network_gflop_per_step": gflop,
         "matmul_gflops": rate,
     }
+    for integrator in OTHERS:
+        timer.seconds.clear()
+        seconds = run(prior, draws=1, steps=20, integrator=integrator)
+        name = f"outside_network_share_{integrator.kind.replace('-', '_')}"
+        measurements[name] = 1 - sum(timer.seconds) / seconds
+    return measurements
+
+
+def split_gibbs_evaluations() -> int:
+    """Return the number of evaluations of a 2D denoiser for one draw of split Gibbs."""
+    posterior = load_problem("gait-monocular").posterior
+    drawn = SplitGibbs(denoiser="2d").sample(posterior, draws=1, progress=False)
+    return drawn.counts["denoiser"]
 
 
 def on_cuda() -> dict[str, float]:
@@ -189,6 +217,7 @@ def main() -> None:
         [sys.executable, __file__, "--memory"], check=True, capture_output=True, text=True
     )
     measurements["memory_gib"] = float(process.stdout)
+    measurements["split_gibbs_evaluations_per_draw"] = split_gibbs_evaluations()
     measurements |= strided()
     if torch.cuda.is_available():
         measurements |= on_cuda()

@@ -14,9 +14,11 @@ from .io.files import (
     load as load,
     load_all as load_all,
     read_joints as read_joints,
-    read_keypoints as read_keypoints,
     save as save,
 )
+from .io.keypoints.files import read_keypoints as read_keypoints
+from .lifting.result import Lift as Lift
+from .lifting.track_lift import lift as lift
 from .motion.motion import (
     JointTrack as JointTrack,
     KeypointTrack as KeypointTrack,

@@ -97,9 +97,9 @@ class RotatedSpectra:
         ]
         # Indices of a block's frequencies in the order of the bases' rows, and of the pairs.
         index = np.arange(_BLOCK * L).reshape(_BLOCK, L)
-        parts = [index[:, start:stop].ravel() for _, start, stop in self._bands]
-        self._order = np.concatenate(parts)
-        self._twice = np.concatenate([2 * part + i for part in parts for i in range(2)])
+        rows = [index[:, start:stop].ravel() for _, start, stop in self._bands]
+        self._order = np.concatenate(rows)
+        self._twice = np.concatenate([2 * row + i for row in rows for i in range(2)])
         to_world = rotation_coefficients(azimuths)  # (A, 3)
         to_canonical = to_world * [1.0, -1.0, 1.0]
         # Quadratic forms in (cos ψ, −sin ψ, 1) as products with their coefficients.

@@ -10,18 +10,21 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 
 from probmotion.comparison import compare
+from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.sampling import Sampler
 from probmotion.samplers import (
     NUTS,
     Ancestral3D,
     Ensemble,
+    ExactSampler,
     MetropolisHastings,
     MultiViewAncestral,
     MultiViewPredictorCorrector,
@@ -40,6 +43,8 @@ from probmotion.samplers.diffusion import (
     StochSync,
     SyncTweedies,
 )
+from probmotion.samplers.independent import Batches
+from probmotion.seeds import NormalStreams
 
 CONDITIONED = (
     "gait-monocular", "gait-occluded", "gait-sparse", "cmu-monocular", "quadruped-monocular",
@@ -55,6 +60,27 @@ class Study:
     about: str
     problems: tuple[str, ...]
     samplers: Mapping[str, Sampler]
+
+
+@dataclass(frozen=True)
+class MirroredSampler(ExactSampler):
+    """Exact draws, each reflected in depth with probability ½.
+
+    Views at elevation 0 do not distinguish these draws from those of the prior.
+    """
+
+    name: ClassVar[str] = "mirrored"
+
+    def _batches(self, posterior: MotionPosterior, seed: int, progress: bool) -> Batches:
+        exact = super()._batches(posterior, seed, progress)
+
+        def draw(streams: NormalStreams, tick: Callable[[], Any]) -> np.ndarray:
+            depth = np.where(streams.uniform() < 0.5, -1.0, 1.0)
+            motions = exact.draw(streams, tick)
+            motions[..., 2] *= depth[:, None, None]
+            return motions
+
+        return Batches(draw, size=1)
 
 
 def conditional_methods(budget: int) -> dict[str, Sampler]:
@@ -101,6 +127,12 @@ STUDIES = {
             "mas, second order": MultiViewAncestral(
                 steps=95, levels=LogSNR(), integrator=SecondOrderSDE()
             ),
+            "exact": ExactSampler(),
+            "exact, mirrored, elevation 0": MirroredSampler(),
+            "mas, second order, elevation 0": MultiViewAncestral(
+                steps=95, levels=LogSNR(), integrator=SecondOrderSDE(), elevation=0.0
+            ),
+            "mvpc, elevation 0": MultiViewPredictorCorrector(steps=58, elevation=0.0),
             "mvpc, elevation 11": MultiViewPredictorCorrector(steps=58, elevation=np.pi / 16),
             "mvpc, elevation 35": MultiViewPredictorCorrector(
                 steps=58, elevation=np.arctan(0.5**0.5)

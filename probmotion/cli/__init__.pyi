@@ -1,6 +1,7 @@
 from .compare import Compare as Compare
 from .denoise import Denoise as Denoise
 from .files import Convert as Convert, Show as Show
+from .lift import Lift as Lift
 from .main import List as List
 from .reference import Reference as Reference
 from .train import TRAINABLE as TRAINABLE

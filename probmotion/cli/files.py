@@ -48,21 +48,26 @@ class Conventions:
 class Show(Conventions):
     """Summarise a file, or a network, sampler or problem by name.
 
-    Files contain motion (.bvh, .npz), keypoints (.json, .npz, .csv), draws (.nc) or a network
-    (.safetensors). The summary of a sampler lists its settings.
+    Files contain motion (.bvh, .npz), keypoints (.json, .csv, .h5, .nc, .npz), draws (.nc) or a
+    network (.safetensors). The summary of a sampler lists its settings.
     """
 
     file: Positional[Path]
     """File, folder of a training run, or name of a shipped network, sampler, preset or problem."""
 
     fps: float | None = None
-    """Frame rate of keypoints in JSON or a table, frames per second."""
+    """Frame rate of keypoints, frames per second; the file's by default."""
 
     skeleton: str | None = None
     """Layout of JSON keypoints or joints to read from a table (see probmotion list)."""
 
+    image_size: Annotated[
+        tuple[float, float] | None, arg(metavar="WIDTH HEIGHT", help_behavior_hint="")
+    ] = None
+    """Size of the image in pixels, for normalised landmarks of MediaPipe."""
+
     figure: Path | None = None
-    """Also write a figure of the motion, or of the first draws, to this .png, .pdf or .svg file."""
+    """Also write a figure of the motion, first draws or keypoints to this .png, .pdf or .svg."""
 
     def run(self) -> None:
         path = file_called(self.file)
@@ -75,7 +80,8 @@ class Show(Conventions):
                 return
         from probmotion.cli.summaries import summarise
 
-        summary = summarise(path, self.fps, self.skeleton, **self.conventions())
+        keypoints = (self.fps, self.skeleton, self.image_size)
+        summary = summarise(path, *keypoints, **self.conventions())
         print(summary.text)
         if self.figure is not None:
             summary.draw(self.figure)
@@ -105,13 +111,16 @@ class Report:
 
 @dataclass(frozen=True)
 class Convert(Conventions):
-    """Convert a motion to another format, frame rate or skeleton."""
+    """Convert a motion to another format, frame rate or skeleton.
+
+    Output files .bvh and .glb contain rigid bones with rotations, .trc and .csv positions only.
+    """
 
     source: Annotated[Positional[Path], arg(name="IN")]
     """Motion (.bvh, .npz) or draws (.nc)."""
 
     target: Annotated[Positional[Path], arg(name="OUT")]
-    """Output file, .bvh or .npz."""
+    """Output file: .bvh, .glb, .npz, .trc or .csv."""
 
     fps: float | None = None
     """Frame rate to resample to, frames per second."""

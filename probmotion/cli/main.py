@@ -17,6 +17,7 @@ from typing import Any
 from probmotion.cli.compare import Compare
 from probmotion.cli.denoise import Denoise
 from probmotion.cli.files import Convert, Report, Show
+from probmotion.cli.lift import Lift
 from probmotion.cli.reference import Reference
 from probmotion.cli.which import Which
 
@@ -33,6 +34,7 @@ commands:
   list       list the named problems, samplers and skeletons
   show       summarise a file, or a network, sampler or problem by name
   convert    convert a motion to another format, frame rate or skeleton
+  lift       lift a video's 2D keypoints to 3D motion, for Blender and the browser
   denoise    denoise recorded 3D joints and fill gaps
   train      train a prior, or a network for evaluating priors
   reference  generate certified reference draws of a problem
@@ -83,7 +85,7 @@ def _first_line(kind: Any) -> str:
 
 _COMMANDS: dict[str, type[Any]] = {
     "compare": Compare, "report": Report, "which": Which, "list": List, "show": Show,
-    "convert": Convert, "denoise": Denoise, "reference": Reference,
+    "convert": Convert, "denoise": Denoise, "lift": Lift, "reference": Reference,
 }  # fmt: skip
 
 

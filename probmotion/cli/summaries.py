@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,9 @@ from typing import Any
 import numpy as np
 
 from probmotion.cli.training_options import listed_clips
+from probmotion.io.keypoints.tracks import KeypointFile
 from probmotion.motion.motion import KeypointTrack, Motion
+from probmotion.motion.presets import PRESETS
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.draws import MotionDraws
 
@@ -19,23 +22,29 @@ __all__ = ["Summary", "kind_of_network", "summarise"]
 
 _MODEL = "model.safetensors"
 _LOSSES = ("loss", "validation_loss")
+_MOMENTS, _MOST_TRACKS = 6, 4  # in figures of keypoints
+_MOST_ROOTS = 4  # named in summaries
 
 
 @dataclass(frozen=True, eq=False)
 class Summary:
-    """Text summary of a file, and n motions (n, L, J, 3), metres, for figures; n may be 0."""
+    """Text summary of a file; n motions (n, L, J, 3), metres, or tracks, for figures."""
 
     text: str
     skeleton: Skeleton
     motions: np.ndarray
     label: str
+    tracks: Sequence[KeypointTrack] = ()
 
     def draw(self, path: Path) -> None:
-        """Write a figure of the motions."""
+        """Write a figure of the motions or tracks."""
         from probmotion.plots.skeletons import draw_skeletons
 
+        if self.tracks:
+            _draw_tracks(self.tracks, path)
+            return
         if not len(self.motions):
-            raise ValueError("figure requires a file with 3D motion, got none")
+            raise ValueError("figure requires a file with motion or keypoints, got none")
         sided = bool(self.skeleton.mirrored_pairs)
         draw_skeletons(
             {self.label: self.motions},
@@ -47,12 +56,17 @@ class Summary:
 
 
 def summarise(
-    path: Path, fps: float | None = None, skeleton: str | None = None, **conventions: Any
+    path: Path,
+    fps: float | None = None,
+    skeleton: str | None = None,
+    image_size: tuple[float, float] | None = None,
+    **conventions: Any,
 ) -> Summary:
     """Return a summary of a file of motion, keypoints or draws, or of a trained network.
 
-    ``fps`` and ``skeleton`` are the frame rate and layout of keypoints in JSON or a table,
-    ``conventions`` the arguments of :func:`~probmotion.load`.
+    ``fps``, ``skeleton`` and ``image_size`` are arguments of
+    :func:`~probmotion.io.keypoints.open_keypoints`, ``conventions`` those of
+    :func:`~probmotion.load`.
 
     Raises
     ------
@@ -61,16 +75,17 @@ def summarise(
     FileNotFoundError
         If the file does not exist.
     """
-    if path.suffix == ".nc":
+    if path.suffix == ".nc" and not _contains_positions(path):
         return _draw_summary(path, MotionDraws.load(path))
     if path.suffix == ".safetensors":
         return _checkpoint_summary(path)
     if (path / _MODEL).is_file():
         return _checkpoint_summary(path / _MODEL)
     if _contains_keypoints(path):
-        from probmotion.io.files import read_keypoints
+        from probmotion.io.keypoints.files import open_keypoints
 
-        return _track_summary(path, read_keypoints(path, fps, skeleton))
+        file = open_keypoints(path, fps, skeleton, image_size=image_size)
+        return _track_summary(path, file)
     from probmotion.io.files import load
 
     return _motion_summary(path, load(path, **conventions))
@@ -97,7 +112,18 @@ def _contains_keypoints(path: Path) -> bool:
         except BadZipFile:
             return False
         return "keypoints.npy" in names and "positions.npy" not in names
-    return path.suffix.lower() in (".json", ".csv", ".h5", ".hdf5") or path.is_dir()
+    keypoints = (".json", ".csv", ".h5", ".hdf5", ".slp", ".nc")
+    return path.suffix.lower() in keypoints or path.is_dir()
+
+
+def _contains_positions(path: Path) -> bool:
+    """Return whether a netCDF file contains keypoints, as those of movement."""
+    from h5py import File, is_hdf5
+
+    if not is_hdf5(path):
+        return False
+    with File(path, "r") as file:
+        return "position" in file
 
 
 def _motion_summary(path: Path, motion: Motion) -> Summary:
@@ -114,15 +140,53 @@ def _motion_summary(path: Path, motion: Motion) -> Summary:
     return Summary("\n".join(text), motion.skeleton, motion.positions[None], motion.name)
 
 
-def _track_summary(path: Path, tracks: list[KeypointTrack]) -> Summary:
+def _track_summary(path: Path, file: KeypointFile) -> Summary:
+    tracks, skeleton = file.tracks, file.tracks[0].skeleton
     count = f"{len(tracks)} keypoint track{'s' if len(tracks) != 1 else ''}"
-    text = [f"{path}: {count}"]
+    text = [f"{path}: {file.format}, {count}"]
     for track in tracks:
-        seen = (track.confidence > 0).mean()
-        text += [f"  {track.name}:", _length(track.frames, track.fps), f"  {seen:.0%} seen"]
-    skeleton = tracks[0].skeleton
-    text.append(_joints(skeleton))
-    return Summary("\n".join(text), skeleton, np.empty((0, 1, skeleton.n_joints, 3)), "")
+        frames = f"  {track.frames} frame{'s' if track.frames != 1 else ''}, fps unknown"
+        length = frames if file.fps is None else _length(track.frames, file.fps)
+        missing = (track.confidence == 0).mean()
+        text += [f"  {track.name}:", f"{length}, {missing:.0%} of keypoints missing"]
+    known = [name for name in PRESETS if Skeleton.preset(name) == skeleton]
+    text += [f"  skeleton {name}" for name in known] + [_joints(skeleton)]
+    empty = np.empty((0, 1, skeleton.n_joints, 3))
+    return Summary("\n".join(text), skeleton, empty, "", tracks)
+
+
+def _draw_tracks(tracks: Sequence[KeypointTrack], path: Path) -> None:
+    """Write a figure with a row of frames per track; missing keypoints are not drawn."""
+    from matplotlib.collections import LineCollection
+    from matplotlib.figure import Figure
+
+    from probmotion.plots.skeletons import joint_sides
+    from probmotion.plots.style import INK, LEFT, PAGE, RIGHT, SIZE, finish_figure
+
+    shown = [track for track in tracks if (track.confidence > 0).any()][:_MOST_TRACKS]
+    if not shown:
+        raise ValueError("figure requires at least one keypoint, got none")
+    figure = Figure(figsize=(PAGE, 1.8 * len(shown)), layout="constrained")
+    for part, track in zip(figure.subfigures(len(shown), squeeze=False)[:, 0], shown, strict=True):
+        part.suptitle(track.name, size=SIZE, color=INK)
+        seen, sides = track.confidence > 0, joint_sides(track.skeleton)
+        colours = [{"left": LEFT, "right": RIGHT, "middle": INK}[side] for side in sides]
+        present = np.flatnonzero(seen.any(axis=1))
+        moments = min(len(present), _MOMENTS)
+        chosen = present[np.linspace(0, len(present) - 1, moments).round().astype(int)]
+        poses = [track.keypoints[frame, seen[frame]] for frame in chosen]
+        half = 0.55 * max(float(np.ptp(pose, axis=0).max()) for pose in poses) + 1e-9
+        row = part.subplots(1, moments, squeeze=False)[0]
+        for axes, frame, pose in zip(row, chosen, poses, strict=True):
+            x, y = (pose.min(axis=0) + pose.max(axis=0)) / 2
+            axes.set(xlim=(x - half, x + half), ylim=(y + half, y - half), aspect="equal")
+            axes.set_axis_off()
+            axes.set_title(f"frame {frame}", size=SIZE, color=INK)
+            axes.scatter(*pose.T, s=4, c=np.array(colours)[seen[frame]], zorder=2)
+            bones = [bone for bone in track.skeleton.bones if seen[frame, list(bone)].all()]
+            lines = [track.keypoints[frame, list(bone)] for bone in bones]
+            axes.add_collection(LineCollection(lines, colors=[colours[j] for j, _ in bones]))
+    finish_figure(figure, path)
 
 
 def _draw_summary(path: Path, draws: MotionDraws) -> Summary:
@@ -220,8 +284,9 @@ def _length(frames: int, fps: float) -> str:
 
 
 def _joints(skeleton: Skeleton) -> str:
-    roots = ", ".join(skeleton.joint_names[root] for root in skeleton.roots)
+    roots = [skeleton.joint_names[root] for root in skeleton.roots]
+    more = f" and {len(roots) - _MOST_ROOTS} others" if len(roots) > _MOST_ROOTS else ""
     return (
-        f"  {skeleton.n_joints} joints, rooted at {roots}, "
+        f"  {skeleton.n_joints} joints, rooted at {', '.join(roots[:_MOST_ROOTS])}{more}, "
         f"{len(skeleton.mirrored_pairs)} left-right pairs"
     )

@@ -2,17 +2,15 @@ from .amc import read_amc as read_amc
 from .asf import AcclaimSkeleton as AcclaimSkeleton, read_asf as read_asf
 from .bvh import read_bvh as read_bvh
 from .bvh_writing import write_bvh as write_bvh
-from .deeplabcut import read_deeplabcut as read_deeplabcut
 from .errors import MotionFileError as MotionFileError, MotionFileWarning as MotionFileWarning
 from .files import (
     files_named as files_named,
     load as load,
     load_all as load_all,
     read_joints as read_joints,
-    read_keypoints as read_keypoints,
     save as save,
 )
-from .keypoint_json import read_keypoint_json as read_keypoint_json
+from .glb import write_glb as write_glb
 from .markers import read_c3d as read_c3d, read_trc as read_trc
 from .npz import (
     read_joint_npz as read_joint_npz,
@@ -22,3 +20,4 @@ from .npz import (
 )
 from .predictions import read_predictions as read_predictions
 from .recordings import Recording as Recording, read_recording as read_recording
+from .tables import write_csv as write_csv, write_trc as write_trc

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import re
 import reprlib
 from collections.abc import Iterator
@@ -12,6 +14,7 @@ __all__ = [
     "LARGEST",
     "MotionFileError",
     "MotionFileWarning",
+    "csv_rows",
     "decoded_lines",
     "errors_in",
     "number",
@@ -74,6 +77,16 @@ def decoded_lines(content: bytes) -> list[str]:
     except UnicodeDecodeError:
         text = content.decode("latin-1")
     return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+
+
+def csv_rows(path: Path) -> list[tuple[int, list[str]]]:
+    """Return the line numbers and cells of the nonempty rows of a CSV table."""
+    try:
+        text = read_bytes(path).decode("utf-8-sig")
+        reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+        return [(reader.line_num, row) for row in reader if any(row)]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise MotionFileError(f"{path}: expected a CSV table ({str(error)[:80]})") from error
 
 
 def number(word: str, where: str) -> float:

@@ -22,15 +22,14 @@ from probmotion.io.conventions import (
     reflected,
     y_up,
 )
-from probmotion.io.deeplabcut import read_deeplabcut
 from probmotion.io.errors import MotionFileError, MotionFileWarning
-from probmotion.io.keypoint_json import read_keypoint_json
+from probmotion.io.glb import write_glb
 from probmotion.io.markers import read_c3d, read_trc
-from probmotion.io.npz import Archive, read_joint_npz, read_keypoint_npz, read_npz, write_npz
-from probmotion.motion.motion import JointTrack, KeypointTrack, Motion
-from probmotion.motion.skeleton import Skeleton
+from probmotion.io.npz import Archive, read_joint_npz, read_npz, write_npz
+from probmotion.io.tables import write_csv, write_trc
+from probmotion.motion.motion import JointTrack, Motion
 
-__all__ = ["files_named", "load", "load_all", "read_joints", "read_keypoints", "save"]
+__all__ = ["files_named", "load", "load_all", "read_joints", "save"]
 
 
 def load(
@@ -189,7 +188,11 @@ def _check_conventions(unit: str | None, up: str | None) -> None:
 
 
 def save(motion: Motion, path: str | Path) -> None:
-    """Write a motion to a ``.bvh`` or ``.npz`` file.
+    """Write a motion to a ``.bvh``, ``.glb``, ``.npz``, ``.trc`` or ``.csv`` file.
+
+    ``.npz`` preserves the motion exactly. ``.bvh`` and ``.glb`` contain rigid bones with rotations
+    (:func:`~probmotion.motion.inverse_kinematics.rigid_motion`), ``.trc`` and ``.csv``
+    positions only.
 
     Raises
     ------
@@ -197,61 +200,24 @@ def save(motion: Motion, path: str | Path) -> None:
         If the suffix is not supported, or the format cannot represent the motion.
     OSError
         If the folder is missing or not writable.
+
+    Warns
+    -----
+    UserWarning
+        If rigid bones do not fit the positions, for ``.bvh`` and ``.glb``.
     """
     path = Path(path)
-    writers = {".bvh": write_bvh, ".npz": write_npz}
+    writers = {
+        ".bvh": write_bvh,
+        ".glb": write_glb,
+        ".npz": write_npz,
+        ".trc": write_trc,
+        ".csv": write_csv,
+    }
     if path.suffix.lower() not in writers:
-        raise ValueError(f"path must end in .bvh or .npz, got {path.suffix!r}")
+        *others, last = writers
+        raise ValueError(f"path must end in {', '.join(others)} or {last}, got {path.suffix!r}")
     writers[path.suffix.lower()](motion, path)
-
-
-def read_keypoints(
-    path: str | Path,
-    fps: float | None = None,
-    skeleton: Skeleton | str | None = None,
-    people: int | None = None,
-) -> list[KeypointTrack]:
-    """Read the 2D keypoint tracks of a file, one per person and camera.
-
-    Parameters
-    ----------
-    path : str or Path
-        COCO, AlphaPose or OpenPose JSON, a folder of OpenPose files, a DeepLabCut ``.csv`` table,
-        or an ``.npz`` archive.
-    fps : float, optional
-        Frames per second; required for JSON files and tables, which do not contain it.
-    skeleton : Skeleton or str, optional
-        Keypoints of a JSON file in the file's order (see
-        :func:`~probmotion.io.keypoint_json.read_keypoint_json`), or the joints to select from a
-        table (see :func:`~probmotion.io.deeplabcut.read_deeplabcut`).
-    people : int, optional
-        Number of people to track in a JSON file without track ids.
-
-    Raises
-    ------
-    MotionFileError
-        If the file contains no keypoint track or is damaged.
-    FileNotFoundError
-        If the file does not exist.
-    ValueError
-        If ``fps`` is missing or not above 0, or ``skeleton`` or ``people`` is not applicable.
-    """
-    path = Path(path)
-    if not path.exists():
-        raise FileNotFoundError(f"path must be an existing file, got {path}")
-    archive = path.suffix.lower() == ".npz"
-    table = path.suffix.lower() in (".csv", ".h5", ".hdf5")
-    unused = {"people": people, "skeleton": skeleton if archive else None}
-    for name, value in unused.items():
-        if value is not None and (archive or table):
-            raise ValueError(f"{name} must be None for {path.suffix} files, got {value!r}")
-    if archive:
-        return read_keypoint_npz(path, fps)
-    if fps is None:
-        raise ValueError(f"fps must be given for {path}, which contains no frame rate, got None")
-    if table:
-        return read_deeplabcut(path, fps, skeleton)
-    return read_keypoint_json(path, fps, skeleton, people)
 
 
 def load_all(

@@ -8,6 +8,7 @@ from .distances import (
     windows as windows,
     yaw_aligned_distances as yaw_aligned_distances,
 )
+from .inverse_kinematics import rigid_motion as rigid_motion
 from .joint_names import canonical_names as canonical_names, mirrored_name as mirrored_name
 from .kinematics import fit_rotations as fit_rotations, forward_kinematics as forward_kinematics
 from .motion import (

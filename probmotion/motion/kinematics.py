@@ -13,7 +13,13 @@ from probmotion.geometry.rotations import vector_to_matrix
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_finite, check_shape
 
-__all__ = ["fit_rotations", "forward_kinematics"]
+__all__ = [
+    "best_rotations",
+    "fit_rotations",
+    "forward_kinematics",
+    "least_rotations",
+    "mean_shape",
+]
 
 # Number of iterations of the alternating fit of rest offsets and rotations.
 _FITS = 3
@@ -142,7 +148,7 @@ def fit_rotations(
     if rest_offsets is None:
         offsets = np.zeros((skeleton.n_joints, 3))
         for joint, below in children.items():
-            offsets[below] = _rest_offsets(positions[:, below] - positions[:, joint, None])
+            offsets[below] = mean_shape(positions[:, below] - positions[:, joint, None])
     else:
         check_shape("rest_offsets", rest_offsets, (skeleton.n_joints, 3))
         offsets = np.asarray(rest_offsets, dtype=np.float64)
@@ -158,18 +164,18 @@ def fit_rotations(
             fitted[:, joint] = fitted[:, parent] + world[:, parent] @ offsets[joint]
         below = children.get(joint, [])
         bones = positions[:, below] - fitted[:, joint, None]
-        world[:, joint] = _best_turns(offsets[below], bones, above)
+        world[:, joint] = best_rotations(offsets[below], bones, above)
         rotations[:, joint] = np.swapaxes(above, -1, -2) @ world[:, joint]
     return rotations, offsets
 
 
-def _rest_offsets(bones: np.ndarray) -> np.ndarray:
+def mean_shape(bones: np.ndarray) -> np.ndarray:
     """Return the rigid set of bones (C, 3) that best fits the bones (L, C, 3) of all frames."""
     lengths = np.linalg.norm(bones, axis=-1).mean(axis=0)
     rest = _of_lengths(bones[0], lengths)
     identity = np.broadcast_to(np.eye(3), (len(bones), 3, 3))
     for _ in range(_FITS if len(lengths) > 1 else 0):
-        rotations = _best_turns(rest, bones, identity)
+        rotations = best_rotations(rest, bones, identity)
         rest = _of_lengths(np.einsum("lij,lci->cj", rotations, bones), lengths)
     return rest
 
@@ -183,7 +189,7 @@ def _of_lengths(vectors: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     return directions * lengths[:, None]
 
 
-def _best_turns(rest: np.ndarray, bones: np.ndarray, above: np.ndarray) -> np.ndarray:
+def best_rotations(rest: np.ndarray, bones: np.ndarray, above: np.ndarray) -> np.ndarray:
     """Return the rotations (L, 3, 3) that best align ``rest`` (C, 3) with ``bones`` (L, C, 3).
 
     Where bones do not determine a rotation, it follows that of the parent, ``above`` (L, 3, 3).
@@ -191,7 +197,7 @@ def _best_turns(rest: np.ndarray, bones: np.ndarray, above: np.ndarray) -> np.nd
     if len(rest) == 0:
         return above.copy()
     if len(rest) == 1:
-        return _least_turns(above @ rest[0], bones[:, 0]) @ above
+        return least_rotations(above @ rest[0], bones[:, 0]) @ above
     products = np.einsum("lci,cj->lij", bones, rest)
     scale = np.linalg.norm(products, axis=(-2, -1))
     weight = _TIE * np.where(scale > 0, scale, 1.0)
@@ -201,7 +207,7 @@ def _best_turns(rest: np.ndarray, bones: np.ndarray, above: np.ndarray) -> np.nd
     return (left * signs) @ right
 
 
-def _least_turns(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+def least_rotations(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Return the smallest rotations that align each ``start`` (L, 3) with ``end``."""
     lengths = np.linalg.norm(start, axis=-1), np.linalg.norm(end, axis=-1)
     nonzero = (lengths[0] > 0) & (lengths[1] > 0)

@@ -1,6 +1,7 @@
 """Preset skeletons: the joint sets of common data sets and 2D pose detectors.
 
-Sources: the data sets' papers, the OpenPose output documentation and the Halpe data set.
+Sources: the data sets' papers, the OpenPose output documentation, the Halpe data set and
+MediaPipe's pose landmark model.
 """
 
 from __future__ import annotations
@@ -81,6 +82,18 @@ _TREES = {
         right_ankle:right_knee head_top:neck neck:pelvis pelvis left_big_toe:left_ankle
         right_big_toe:right_ankle left_small_toe:left_ankle right_small_toe:right_ankle
         left_heel:left_ankle right_heel:right_ankle""",
+    # MediaPipe's pose landmarks. As for coco17, the shoulders are children of the nose.
+    "mediapipe33": """
+        nose left_eye_inner:nose left_eye:left_eye_inner left_eye_outer:left_eye
+        right_eye_inner:nose right_eye:right_eye_inner right_eye_outer:right_eye
+        left_ear:left_eye_outer right_ear:right_eye_outer mouth_left:nose mouth_right:nose
+        left_shoulder:nose right_shoulder:nose left_elbow:left_shoulder
+        right_elbow:right_shoulder left_wrist:left_elbow right_wrist:right_elbow
+        left_pinky:left_wrist right_pinky:right_wrist left_index:left_wrist
+        right_index:right_wrist left_thumb:left_wrist right_thumb:right_wrist
+        left_hip:left_shoulder right_hip:right_shoulder left_knee:left_hip right_knee:right_hip
+        left_ankle:left_knee right_ankle:right_knee left_heel:left_ankle right_heel:right_ankle
+        left_foot_index:left_ankle right_foot_index:right_ankle""",
     # OpenPose's COCO model with 18 keypoints.
     "openpose18": """
         nose:neck neck right_shoulder:neck right_elbow:right_shoulder right_wrist:right_elbow

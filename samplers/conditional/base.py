@@ -76,11 +76,15 @@ class ConditionalSampler(IndependentSampler):
                 others=suited(posterior),
             )
         observations = LinearObservations.of(self, posterior)
-        if not observations.precision.any():
+        self._check_observed(observations.precision)
+        return observations
+
+    @staticmethod
+    def _check_observed(precision: np.ndarray) -> None:
+        if not precision.any():
             raise ValueError(
                 "likelihood must contain an observed entry, got none; sample the prior instead"
             )
-        return observations
 
     def _pools(
         self,

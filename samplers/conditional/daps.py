@@ -14,7 +14,7 @@ from probmotion.samplers.conditional.base import (
     DenoiserChoice,
     VarianceExploding,
 )
-from probmotion.samplers.conditional.coupling import Coupling
+from probmotion.samplers.conditional.coupling import Coupling, Quadratic
 from probmotion.samplers.diffusion.guidance import LinearObservations
 from probmotion.samplers.diffusion.noise_levels import AnyLevels, Karras
 from probmotion.seeds import NormalStreams
@@ -66,6 +66,7 @@ class DAPS(AnnealedSampler):
         streams: NormalStreams,
         tick: Callable[[], Any],
     ) -> np.ndarray:
+        likelihood = Quadratic.of(observations)
         z = np.zeros((len(streams.generators), *shape))
         for level, sigma in enumerate(sigmas):
             clean = pools[level % len(pools)]
@@ -74,6 +75,6 @@ class DAPS(AnnealedSampler):
             for now, after in pairwise(below):
                 estimate = clean(x, now)
                 x = estimate + after / now * (x - estimate)
-            z = Coupling(observations, sigma).draw(clean(x, below[-1]), streams.normal(*shape))
+            z = Coupling(likelihood, sigma).draw(clean(x, below[-1]), streams.normal(*shape))
             tick()
         return z

@@ -3,32 +3,40 @@
 The joint density p(x) N(z; x, ρ²) N(y; A z, σ_y² − ρ²) has the marginal p(x) N(y; A x, σ_y²), the
 posterior, for any ρ < σ_y (Vono et al. 2019; the subtraction of ρ² makes it exact at finite ρ).
 Gibbs sweeps alternate between z | x, a Gaussian per frame and joint, and x | z, the reverse
-diffusion from noise level ρ, started at z (Wu et al. 2024, Xu and Chi 2024).
+diffusion from noise level ρ, started at z (Wu et al. 2024, Xu and Chi 2024). Perspective cameras
+and Student-t noise have Metropolis-Hastings steps of z, and precision factors of their entries
+(:mod:`~probmotion.samplers.conditional.z_steps`).
 
 Sweeps move by about ρ, and need thousands to cross the unobserved depth. The marginal of z,
 p_ρ(z) N(y; A z, σ_y² − ρ²), has the score (D(z, ρ) − z)/ρ² + Aᵀ (y − A z)/(σ_y² − ρ²) at the cost
-of one estimate D, so underdamped Langevin dynamics of z under falling ρ come before the sweeps.
+of one estimate D, so underdamped Langevin dynamics of z under falling ρ come before the sweeps. For
+observations that are not linear and Gaussian, these are linearised at each ρ, which is approximate;
+the sweeps are not.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
+from probmotion.posteriors.likelihoods import Joints3D, Keypoints2D
 from probmotion.posteriors.posterior import MotionPosterior
+from probmotion.posteriors.sampling import UnsupportedPosterior, suited
 from probmotion.samplers.conditional.base import (
     ConditionalSampler,
     DenoiserChoice,
     VarianceExploding,
 )
-from probmotion.samplers.conditional.coupling import Coupling, times
+from probmotion.samplers.conditional.coupling import Coupling, Quadratic, times
+from probmotion.samplers.conditional.keypoints import Observations
+from probmotion.samplers.conditional.z_steps import GaussianStep, MetropolisStep, ZStep
 from probmotion.samplers.diffusion.ancestral import AncestralSampler, reverse_diffusion
 from probmotion.samplers.diffusion.ancestral3d import Ancestral3D
-from probmotion.samplers.diffusion.guidance import LinearObservations
+from probmotion.samplers.diffusion.guidance import can_guide
 from probmotion.samplers.diffusion.integrators import SecondOrderSDE
 from probmotion.samplers.diffusion.mvpc import MultiViewPredictorCorrector
 from probmotion.samplers.diffusion.noise_levels import Karras
@@ -40,6 +48,7 @@ from probmotion.validation import check_count, check_positive
 
 __all__ = ["SplitGibbs"]
 
+_PRIOR = 80.0  # noise level at which a noisy motion says nothing of the clean one
 _RINGS = 3  # of views of learnt denoisers
 _STEPS_PER_LEVEL = 4  # Langevin steps at one ρ
 _ANNEALED_TO = 0.7  # last ρ of the Langevin dynamics, in σ_y
@@ -52,6 +61,8 @@ _POWER = 5  # of its spacing (Karras et al. 2022, equation 5)
 class SplitGibbs(ConditionalSampler):
     """Split Gibbs sampler with a diffusion prior, started by guided sampling.
 
+    Observations are keypoints, joints, or others that are linear with Gaussian noise.
+
     Parameters
     ----------
     steps : int
@@ -63,7 +74,9 @@ class SplitGibbs(ConditionalSampler):
     largest : float
         First ρ, normalised units. Larger values leave the mode of the guided start.
     share : float
-        Last ρ in units of the smallest σ_y, below 1.
+        Last ρ in units of the smallest σ_y, below 1. With several cameras, σ_y is that of a joint
+        given all of them; with Student-t noise, that of the largest precision factor; with
+        perspective cameras, that at half of the mean depth.
     start_steps : int
         Number of noise levels of the guided start.
     denoiser : {"any", "3d", "2d"}
@@ -104,6 +117,14 @@ class SplitGibbs(ConditionalSampler):
                 f"{self.share}; use .95"
             )
 
+    @staticmethod
+    def draws_from(posterior: MotionPosterior) -> bool:
+        """Return whether the posterior has keypoints, joints or linear Gaussian observations."""
+        likelihood = posterior.likelihood
+        if isinstance(likelihood, Keypoints2D | Joints3D):
+            return True
+        return likelihood is not None and can_guide(posterior)
+
     def _start(self, in_3d: bool) -> AncestralSampler:
         """Return the guided sampler of the starting points."""
         if in_3d:
@@ -119,18 +140,26 @@ class SplitGibbs(ConditionalSampler):
         )
 
     def _batches(self, posterior: MotionPosterior, seed: int, progress: bool) -> Batches:
-        observations = self._observations(posterior)
+        if not self.draws_from(posterior) and posterior.likelihood is not None:
+            raise UnsupportedPosterior(
+                self.name,
+                "supports keypoints, joints and linear Gaussian likelihoods, got "
+                f"{type(posterior.likelihood).__name__}",
+                word="observations",
+                others=suited(posterior),
+            )
         pools = self._pools(posterior, self.n_views, self.elevation, rings=_RINGS)
+        step, linear = self._step(posterior, pools[0])
         start = self._start(isinstance(pools[0].denoiser, MotionDenoiser))._batches(
-            posterior, seed, progress
+            linear, seed, progress
         )
         sources = [start.counts, pools[0].denoiser.counts]
         counts = {"denoiser": 0}
 
         def draw(streams: NormalStreams, tick: Callable[[], Any]) -> np.ndarray:
             x = start.draw(streams, tick)
-            x = self._anneal(pools, observations, x, streams, tick)
-            x = self._sweep(pools, observations, x, streams, tick)
+            x = self._anneal(pools, step, x, streams, tick)
+            x = self._sweep(pools, step, x, streams, tick)
             for name in {name for source in sources for name in source}:
                 counts[name] = sum(source.get(name, 0) for source in sources)
             return x
@@ -139,14 +168,33 @@ class SplitGibbs(ConditionalSampler):
         scale = posterior.prior.scale  # type: ignore[attr-defined]
         return Batches(draw, self.batch, ticks, scale, counts)
 
-    def _noise(self, observations: LinearObservations) -> float:
-        """Return the smallest σ_y, normalised units."""
-        return 1 / math.sqrt(observations.precision.max())
+    def _step(
+        self, posterior: MotionPosterior, clean: VarianceExploding
+    ) -> tuple[ZStep, MotionPosterior]:
+        """Return the step of z, and the linear Gaussian posterior of the start."""
+        if can_guide(posterior):
+            return GaussianStep(Quadratic.of(self._observations(posterior))), posterior
+        likelihood, prior = posterior.likelihood, posterior.prior
+        assert isinstance(likelihood, Keypoints2D | Joints3D)
+        self._check_observed(likelihood.entries.precision)
+        scale: float = prior.scale  # type: ignore[attr-defined]
+        # At high noise, the estimate is the mean of the prior.
+        blank = np.zeros((1, posterior.frames, posterior.skeleton.n_joints, 3))
+        centre = clean(blank, _PRIOR).mean(axis=(0, 1, 2))
+        step = MetropolisStep(Observations(likelihood, scale, centre), centre)
+        linear = replace(likelihood, degrees_of_freedom=None)
+        if isinstance(linear, Keypoints2D):
+            cameras = linear.cameras
+            if not cameras.orthographic:
+                depth = cameras.depth(scale * centre[None, None])[:, 0, 0]
+                cameras = replace(cameras, focal=cameras.focal / depth, orthographic=True)
+            linear = replace(linear, cameras=cameras)
+        return step, _LinearPosterior(prior, linear)
 
     def _anneal(
         self,
         pools: list[VarianceExploding],
-        observations: LinearObservations,
+        step: ZStep,
         x: np.ndarray,
         streams: NormalStreams,
         tick: Callable[[], Any],
@@ -155,15 +203,15 @@ class SplitGibbs(ConditionalSampler):
         if self.steps == 0:
             return x
         shape = x.shape[1:]
-        last = _ANNEALED_TO * self._noise(observations)
+        last = _ANNEALED_TO * step.noise
         levels = -(-self.steps // _STEPS_PER_LEVEL)
         rhos = np.geomspace(max(self.largest, last), last, levels)
-        z = Coupling(observations, rhos[0], split=True).draw(x, streams.normal(*shape))
+        z = step.coupling(x, rhos[0], streams).draw(x, streams.normal(*shape))
         velocity = streams.normal(*shape)
         kept = math.exp(-_FRICTION * _STEP)
         for level, rho in enumerate(rhos):
             clean = pools[level % len(pools)]
-            coupling = Coupling(observations, rho, split=True)
+            coupling = step.coupling(z, rho, streams)
 
             def kick(
                 z: np.ndarray,
@@ -187,17 +235,17 @@ class SplitGibbs(ConditionalSampler):
     def _sweep(
         self,
         pools: list[VarianceExploding],
-        observations: LinearObservations,
+        step: ZStep,
         x: np.ndarray,
         streams: NormalStreams,
         tick: Callable[[], Any],
     ) -> np.ndarray:
         """Return x after Gibbs sweeps at the last ρ."""
-        rho = self.share * self._noise(observations)
-        coupling = Coupling(observations, rho, split=True)
+        rho = self.share * step.noise
+        auxiliary = None
         for sweep in range(self.sweeps):
-            z = coupling.draw(x, streams.normal(*x.shape[1:]))
-            x = self._reverse(pools[sweep % len(pools)], z, rho, streams)
+            auxiliary = step.draw(x, rho, streams, auxiliary)
+            x = self._reverse(pools[sweep % len(pools)], auxiliary.z, rho, streams)
             tick()
         return x
 
@@ -209,3 +257,10 @@ class SplitGibbs(ConditionalSampler):
         state = MotionState([clean.denoiser], schedule, z.shape[1:])
         x = math.sqrt(schedule.alpha_bar[-1]) * z
         return reverse_diffusion(state, streams, x, lambda: None, SecondOrderSDE())
+
+
+class _LinearPosterior(MotionPosterior):
+    """Posterior of linearised observations, whose outliers the prior does not reject."""
+
+    def __post_init__(self) -> None:
+        pass

@@ -96,8 +96,8 @@ class AncestralSampler(NoiseLevels, IndependentSampler):
     def _batches(self, posterior: MotionPosterior, seed: int, progress: bool) -> Batches:
         if getattr(self, "elevation", None) == 0:
             warnings.warn(
-                f"{self.name} cannot distinguish a motion from its mirror image with elevation 0; "
-                "use an elevation such as pi/16",
+                f"{self.name} cannot distinguish a motion from its mirror image with elevation 0: "
+                "half of the draws are reflected in depth; use an elevation such as pi/16",
                 stacklevel=3,
             )
         state, options = self._state(posterior), self._options()

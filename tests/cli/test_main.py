@@ -14,6 +14,7 @@ from unittest.mock import Mock
 import numpy as np
 import pandas as pd
 import pytest
+import xarray as xr
 
 import probmotion
 from probmotion import MotionDraws, Skeleton
@@ -22,6 +23,7 @@ from probmotion.cli.settings_options import object_from_text, sampler_called, te
 from probmotion.data.synthetic.gaits import make_gait
 from probmotion.io.files import load, save
 from probmotion.models.training.checkpoints import WEIGHTS
+from probmotion.motion.inverse_kinematics import rigid_motion
 from probmotion.posteriors.sampling import importable_samplers
 
 PNG = b"\x89PNG"
@@ -262,9 +264,35 @@ def test_show_reads_deeplabcut_tables(tmp_path, capsys, fails):
     )
     assert main(["show", str(path), "--fps", "10"]) == 0
     printed = capsys.readouterr().out
-    assert f"{path}: 1 keypoint track\n" in printed
-    assert "2 frames at 10 fps, 0.10 s\n  75% seen\n  2 joints, rooted at nose, tail" in printed
-    assert "fps" in fails("show", path)
+    assert f"{path}: DeepLabCut, 1 keypoint track\n" in printed
+    assert "2 frames at 10 fps, 0.10 s, 25% of keypoints missing\n  2 joints, root" in printed
+    figure = tmp_path / "mouse.png"
+    assert main(["show", str(path), "--figure", str(figure)]) == 0
+    assert "2 frames, fps unknown, 25% of keypoints missing" in capsys.readouterr().out
+    assert figure.stat().st_size > 1000
+    path.write_text(path.read_text().replace(",0.5", ""))
+    assert "cells as in the first row" in fails("show", path)
+
+
+def test_show_scales_landmarks_and_reads_movement(tmp_path, capsys, fails):
+    path = tmp_path / "pose.json"
+    points = [{"x": 0.5, "y": 0.1, "visibility": 1}] * 33
+    frames = [
+        {"pose_landmarks": person, "timestamp_ms": t} for person, t in ((points, 0), (None, 40))
+    ]
+    path.write_text(json.dumps(frames))
+    assert "(--image-size WIDTH HEIGHT)" in fails("show", path)
+    assert main(["show", str(path), "--image-size", "640", "480"]) == 0
+    printed = capsys.readouterr().out
+    assert f"{path}: MediaPipe Pose, 1 keypoint track\n" in printed
+    assert "2 frames at 25 fps, 0.04 s, 50% of keypoints missing\n  skeleton mediapipe33" in printed
+    path = tmp_path / "clip.nc"
+    dims = {"time": [0, 1], "space": ["x", "y"], "keypoint": ["nose"], "individual": ["mouse"]}
+    positions = xr.DataArray(np.ones((2, 2, 1, 1)), dims, list(dims))
+    xr.Dataset({"position": positions}, attrs={"fps": 20.0}).to_netcdf(path, engine="h5netcdf")
+    assert main(["show", str(path)]) == 0
+    printed = capsys.readouterr().out
+    assert f"{path}: movement, 1 keypoint track\n  clip mouse:\n  2 frames at 20 fps" in printed
 
 
 def test_show_and_convert_draws(tmp_path, capsys, fails):
@@ -274,8 +302,9 @@ def test_show_and_convert_draws(tmp_path, capsys, fails):
     assert "4 x 3 (chains x draws)" in capsys.readouterr().out
     target = tmp_path / "draw.bvh"
     assert main(["convert", str(path), str(target), "--draw", "2"]) == 0
-    expected = MotionDraws.load(path).motion(2).positions
-    np.testing.assert_allclose(load(target).positions, expected, atol=1e-4)
+    expected = rigid_motion(MotionDraws.load(path).motion(2))
+    back = load(target).retarget(expected.skeleton)
+    np.testing.assert_allclose(back.positions, expected.positions, atol=1e-4)
     assert fails("convert", path, target, "--draw", "3") == "draw must be 0 to 2, got 3"
     assert fails("convert", target, target, "--draw", "0").startswith("draw requires a file of dr")
 

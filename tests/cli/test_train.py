@@ -162,7 +162,7 @@ def test_invalid_options_give_one_error_line_and_no_files(walks, tmp_path, monke
         f"--clips {tmp_path}/no.bvh": "no.bvh: No such file or directory",
         f"--clips {tmp_path}/no*.bvh": "no*.bvh",
         f"--tracks {tmp_path}/no.npz": "no.npz",
-        f"--tracks {table}": "fps",
+        f"--tracks {table}": "expected the rows scorer",
         f"{clips} --tracks-fps 30": "tracks_fps requires --tracks",
         "--tracks a.json --views 64": "views applies to 3D clips only",
         "--skeleton own": "skeleton 'own' requires --tracks",

@@ -10,7 +10,8 @@ from probmotion import Skeleton
 from probmotion.cli.main import main
 from probmotion.data.projections import DetectorNoise, project_clips
 from probmotion.data.synthetic.gaits import make_gaits
-from probmotion.io.files import read_keypoints, save
+from probmotion.io.files import save
+from probmotion.io.keypoints.files import read_keypoints
 from probmotion.models.vae.motion_vae import MotionVAE
 
 PERSON = Skeleton.preset("person14")

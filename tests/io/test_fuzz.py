@@ -2,19 +2,22 @@
 
 import io
 import json
+import pickle
 import tempfile
 import warnings
 import zipfile
 from functools import partial
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
 from probmotion.io.bvh import read_bvh
 from probmotion.io.errors import MotionFileError, MotionFileWarning
-from probmotion.io.files import load, read_joints, read_keypoints
+from probmotion.io.files import load, read_joints
+from probmotion.io.keypoints.files import read_keypoints
 from probmotion.motion.motion import JointTrack, KeypointTrack, Motion
 from probmotion.motion.presets import PRESETS
 
@@ -65,9 +68,21 @@ RESULTS = [{"image_id": f"{i}.jpg", "keypoints": PERSON, "idx": 1} for i in rang
 OPENPOSE = {"people": [{"person_id": [-1], "pose_keypoints_2d": PERSON}]}
 ALPHAPOSE = {"1.jpg": OPENPOSE, "3.jpg": OPENPOSE}
 CMU = {"1.jpg": {"bodies": [{"joints": PERSON}]}}
+POINTS = [[float(i), 2.0] for i in range(17)]
+INSTANCE = {"keypoints": POINTS, "keypoint_scores": [0.5] * 17, "bbox": [[0, 0, 9, 9]]}
+MMPOSE = {
+    "meta_info": {"keypoint_id2name": {str(i): f"k{i}" for i in range(17)}},
+    "instance_info": [{"frame_id": i, "instances": [INSTANCE]} for i in (1, 2)],
+}
+RTMPOSE = {"fps": 30, "frames": [{"keypoints": [POINTS], "scores": [[0.5] * 17]}] * 2}
+LANDMARKS = [{"x": 100.0 + i, "y": 200, "visibility": 0.9} for i in range(33)]
+MEDIAPIPE = [{"timestamp_ms": 33 * i, "pose_landmarks": LANDMARKS} for i in range(2)]
 JSONS = [
     json.dumps(content, indent=1).encode()
-    for content in (COCO, RESULTS, OPENPOSE, ALPHAPOSE, CMU, [OPENPOSE, OPENPOSE])
+    for content in (
+        *(COCO, RESULTS, OPENPOSE, ALPHAPOSE, CMU, [OPENPOSE, OPENPOSE]),
+        *(MMPOSE, [INSTANCE], RTMPOSE, MEDIAPIPE),
+    )
 ]
 TABLE = b"""scorer,net,net,net,net,net
 individuals,mouse,mouse,mouse,single,single
@@ -76,6 +91,17 @@ coords,x,y,likelihood,x,y
 7,1,2,0.5,0,9
 8,nan,,,0,9
 """
+LANDMARK_TABLE = "\n".join(
+    ",".join(map(str, row))
+    for row in (
+        [
+            "frame",
+            *(f"{name}_{axis}" for name in PRESETS["mediapipe33"].joint_names for axis in "xyv"),
+        ],
+        [0, *range(99)],
+        [1, *range(99)],
+    )
+).encode()
 JOINTS = PRESETS["person14"].joint_names
 TRC = "\n".join(
     "\t".join(map(str, row))
@@ -94,6 +120,49 @@ for more in ({}, {"keypoints": np.zeros((4, 2, 2)), "confidence": np.ones((4, 2)
     file = io.BytesIO()
     np.savez(file, **MOTION, **more)
     ARCHIVES.append(file.getvalue())
+HDF5 = []
+
+
+def hdf5_of(group, datasets, **attributes):
+    file = io.BytesIO()
+    with h5py.File(file, "w") as archive:
+        home = archive.require_group(group)
+        home.attrs.update(attributes)
+        for key, value in datasets.items():
+            home[key] = value
+        if "table" in home:
+            columns = [("net", "snout", axis) for axis in ("x", "y", "likelihood")]
+            home["table"].attrs["values_block_0_kind"] = np.bytes_(pickle.dumps(columns, 0))
+        if "position" in home:
+            for axis, name in enumerate(("time", "space", "keypoint", "individual")):
+                home[name].make_scale(name)
+                home["position"].dims[axis].attach_scale(home[name])
+    HDF5.append(file.getvalue())
+
+
+hdf5_of(
+    "/",
+    {
+        "tracks": np.ones((1, 2, 3, 4)),
+        "point_scores": np.ones((1, 3, 4)),
+        "node_names": np.array([b"a", b"b", b"c"]),
+        "edge_inds": np.array([[0, 1]]),
+    },
+)
+hdf5_of(
+    "/",
+    {
+        "position": np.ones((4, 2, 3, 1)),
+        "time": np.arange(4.0),
+        "space": np.array([b"x", b"y"]),
+        "keypoint": np.array([b"a", b"b", b"c"]),
+        "individual": np.array([b"a"]),
+    },
+    fps=25.0,
+)
+ROWS = np.ones(4, dtype=[("index", "<i8"), ("values_block_0", "<f8", (3,))])
+ROWS["index"] = range(4)
+hdf5_of("tracks", {"table": ROWS}, pandas_type=np.bytes_("frame_table"))
 SNIPPETS = [
     *(b"\r", b"\n", b"\r\n", b"\t", b"\x00", b"\xff", b"\xef\xbb\xbf", b"{", b"}", b"[", b"]"),
     *(b'"', b",", b":", b"nan", b"NaN", b"-Infinity", b"null", b"true", b"-1", b"0", b"1e308"),
@@ -161,7 +230,8 @@ FORMATS = [
     (ARCHIVES, ".npz", load),
     (ARCHIVES[1:], ".npz", read_tracks),
     (JSONS, ".json", read_tracks),
-    ([TABLE], ".csv", read_tracks),
+    ([TABLE, LANDMARK_TABLE], ".csv", read_tracks),
+    (HDF5, ".h5", read_tracks),
     ([TRC], ".trc", read_joints),
     (ARCHIVES, ".npz", partial(read_joints, unit="m")),
 ]
@@ -212,7 +282,9 @@ KEYS = st.sampled_from(
     [
         *("images", "annotations", "categories", "people", "bodies", "joints", "keypoints", "name"),
         *("image_id", "id", "idx", "track_id", "person_id", "file_name", "frame_id", "video_id"),
-        *("category_id", "skeleton", "pose_keypoints_2d", "3.jpg"),
+        *("category_id", "skeleton", "pose_keypoints_2d", "3.jpg", "instance_info", "instances"),
+        *("keypoint_scores", "scores", "frames", "pose_landmarks", "fps", "timestamp_ms"),
+        *("landmark", "x", "y", "meta_info", "keypoint_id2name", "skeleton_links"),
     ]
 )
 
@@ -228,6 +300,6 @@ def test_any_json(content):
 
 
 def test_files_of_other_formats():
-    for content in [BVH, *ARCHIVES, *JSONS, b"", BVH.decode().encode("utf-16")]:
+    for content in [BVH, *ARCHIVES, *JSONS, *HDF5, b"", BVH.decode().encode("utf-16")]:
         for _, ending, read in FORMATS:
             check(content, ending, read)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from probmotion.io.errors import MotionFileError, MotionFileWarning
-from probmotion.io.files import load, read_keypoints, save
+from probmotion.io.files import load, save
+from probmotion.io.keypoints.files import read_keypoints
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
 
@@ -182,6 +183,6 @@ def test_failed_writes_leave_no_file(tmp_path):
     motion = load(archive(tmp_path))
     with pytest.raises(OSError, match=r"cannot write .*choose a writable folder"):
         save(motion, tmp_path / "none" / "clip.npz")
-    with pytest.raises(ValueError, match=r"path must end in \.bvh or \.npz, got '\.txt'"):
+    with pytest.raises(ValueError, match=r"path must end in \.bvh, .*\.trc or \.csv, got '\.txt'"):
         save(motion, tmp_path / "clip.txt")
     assert [path.name for path in tmp_path.iterdir()] == ["clip.npz"]

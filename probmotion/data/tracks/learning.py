@@ -15,7 +15,8 @@ from probmotion.data.projections import Centre, DetectorNoise, Filming, project_
 from probmotion.data.synthetic.walks import shared_skeleton, synthetic_walks
 from probmotion.data.tracks.preparation import PreparedTracks, prepare_tracks
 from probmotion.data.tracks.scales import bone_sizes, per_track_scales, scale_to_bones
-from probmotion.io.files import files_named, read_keypoints
+from probmotion.io.files import files_named
+from probmotion.io.keypoints.files import read_keypoints
 from probmotion.motion.motion import KeypointTrack, Motion
 from probmotion.motion.skeleton import Skeleton
 from probmotion.motion.splits import Split, clip_of, split_clips, tracks_of_clips
@@ -151,7 +152,7 @@ def read_tracks(
         Frames per second of files that do not contain it.
     layout, people
         Keypoint layout and number of people, for files that do not contain them; see
-        :func:`~probmotion.io.read_keypoints`.
+        :func:`~probmotion.io.keypoints.read_keypoints`.
     threshold : float
         Minimum confidence of a detection.
     centre : {"frame", "sequence"}

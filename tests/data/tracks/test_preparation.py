@@ -8,7 +8,7 @@ import pytest
 from probmotion.data.synthetic.gaits import make_gait
 from probmotion.data.tracks.preparation import prepare_tracks
 from probmotion.data.tracks.scales import bone_sizes
-from probmotion.io.files import read_keypoints
+from probmotion.io.keypoints.files import read_keypoints
 from probmotion.motion.motion import KeypointTrack
 from probmotion.motion.skeleton import Skeleton
 from probmotion.motion.splits import clip_of

@@ -11,7 +11,7 @@ import pytest
 from probmotion import KeypointTrack, Skeleton
 from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.interaction.annotations.tracks import annotations_of_tracks
-from probmotion.io.files import read_keypoints
+from probmotion.io.keypoints.files import read_keypoints
 
 PAIR = Skeleton.preset("pair17")
 TRUNK = ("spine", "left_hip", "right_hip", "left_shoulder", "right_shoulder")

@@ -9,7 +9,7 @@ import pytest
 
 from probmotion import Cameras, Joints3D, Keypoints2D, Motion, MotionPosterior, UnsupportedPosterior
 from probmotion.samplers.conditional import DAPS, REDDiff, TwistedDiffusion
-from probmotion.samplers.conditional.coupling import Coupling
+from probmotion.samplers.conditional.coupling import Coupling, Quadratic
 from probmotion.samplers.conditional.twisted import _resampled
 from probmotion.samplers.diffusion import LogSNR
 from probmotion.samplers.diffusion.guidance import LinearObservations
@@ -33,7 +33,7 @@ def test_couplings_are_gaussian(gaussian_motion, gaussian, keypoints, assert_cov
     isotropic = gaussian_motion(0.7 * x, (0.7 * rho) ** 2 * np.eye(12), scale=0.7)
     mean, covariance = isotropic.posterior(keypoints)
     observations = LinearObservations.of(DAPS(), MotionPosterior(gaussian, keypoints))
-    coupling = Coupling(observations, rho)
+    coupling = Coupling(Quadratic.of(observations), rho)
     many = np.broadcast_to(x, (6000, *x.shape))
     np.testing.assert_allclose(0.7 * coupling.mean(many[:1])[0], mean, atol=1e-10)
     noise = np.random.default_rng(2).standard_normal(many.shape)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from probmotion import Cameras, Keypoints2D, Motion, MotionPosterior
-from probmotion.samplers.conditional import SplitGibbs, split_gibbs
-from probmotion.samplers.conditional.coupling import Coupling
+from probmotion.samplers.conditional import SplitGibbs, z_steps
+from probmotion.samplers.conditional.coupling import Coupling, Quadratic
 from probmotion.samplers.diffusion.guidance import LinearObservations
 from probmotion.seeds import NormalStreams
 
@@ -41,13 +41,21 @@ def test_draws_are_exact_at_finite_coupling(gaussian, keypoints, assert_covarian
     assert_exact(sampler, gaussian, keypoints, assert_covariance)
 
 
+def test_draws_are_exact_with_several_cameras(gaussian, keypoints, assert_covariance):
+    """Cameras of other focal lengths, which see a joint from similar directions."""
+    cameras = Cameras.around([0.3, 0.5, 2.0], [0.2, 0.1, 0.0])
+    cameras = replace(cameras, focal=np.array([1.0, 2.0, 0.5]))
+    seen = Keypoints2D(cameras.project(gaussian.mean), cameras, noise=0.3)
+    assert_exact(SplitGibbs(steps=60, sweeps=6), gaussian, seen, assert_covariance)
+
+
 def test_without_subtraction_draws_are_not_exact(
     gaussian, keypoints, assert_covariance, monkeypatch
 ):
-    def unsplit(observations, rho, *, split):
-        return Coupling(observations, rho)
+    def unsplit(likelihood, rho, gains):
+        return Coupling(likelihood, rho)
 
-    monkeypatch.setattr(split_gibbs, "Coupling", unsplit)
+    monkeypatch.setattr(z_steps, "Coupling", unsplit)
     with pytest.raises(AssertionError):
         assert_exact(SplitGibbs(steps=60, sweeps=6), gaussian, keypoints, assert_covariance)
 
@@ -75,7 +83,8 @@ def test_scores_are_those_of_the_marginal(gaussian, keypoints):
     prior = replace(gaussian, scale=1.0)
     observations = LinearObservations.of(SplitGibbs(), MotionPosterior(prior, keypoints))
     clean = SplitGibbs()._pools(MotionPosterior(prior))[0]
-    coupling = Coupling(observations, rho, split=True)
+    likelihood = Quadratic.of(observations)
+    coupling = Coupling(likelihood, rho, likelihood.gains(rho))
     wide = np.linalg.inv(prior.covariance + rho**2 * np.eye(12))
     axes, target, precision = keypoints.linear()
     weight = np.where(precision > 0, 1 / (keypoints.noise**2 - rho**2), 0.0)

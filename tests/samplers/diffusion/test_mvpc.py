@@ -11,7 +11,13 @@ import pytest
 from probmotion import Cameras, MotionPosterior
 from probmotion.samplers import MultiViewAncestral, MultiViewPredictorCorrector
 from probmotion.samplers.diffusion import DDPM, Cosine, SecondOrderSDE
-from probmotion.samplers.diffusion.views import MultiViewDenoiser, Views, pools, view_sets
+from probmotion.samplers.diffusion.views import (
+    MultiViewDenoiser,
+    Views,
+    pools,
+    view_sets,
+    views_around,
+)
 
 
 def test_mvpc_without_gamma_and_corrector_equals_mas(gaussian):
@@ -161,3 +167,19 @@ def test_the_corrector_preserves_the_pool_of_the_views(gaussian_motion):
         after = move @ pool @ move.T + 2 * size * (1 - alpha_bar) * spread
         errors.append(abs(after - pool).max())
     assert errors[0] == pytest.approx(4 * errors[1], rel=1e-9)
+
+
+@pytest.mark.parametrize("elevation", [0.0, 0.2])
+def test_elevation_0_does_not_distinguish_mirror_images(gaussian, elevation):
+    """A pool of views of a denoiser that ignores the azimuth commutes with reflection in depth."""
+
+    class AnyAzimuth(type(gaussian)):
+        def denoise(self, x_t, alpha_bar, cameras):
+            same = Cameras.around(np.zeros(cameras.n_views), cameras.elevation)
+            return super().denoise(x_t, alpha_bar, same)
+
+    prior = AnyAzimuth(gaussian.mean, gaussian.covariance)
+    pool = MultiViewDenoiser(prior, Views(views_around(5, elevation)))
+    x, mirror = np.random.default_rng(0).normal(size=(3, 2, 2, 3)), np.array([1.0, 1.0, -1.0])
+    difference = pool.denoise(mirror * x, 0.5) - mirror * pool.denoise(x, 0.5)
+    assert (np.abs(difference).max() < 1e-12) == (elevation == 0)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from probmotion.io.errors import MotionFileError
-from probmotion.io.files import read_keypoints
-from probmotion.io.keypoint_tracks import natural
+from probmotion.io.keypoints.files import read_keypoints
+from probmotion.io.keypoints.tracks import natural
 from probmotion.motion.skeleton import Skeleton
 
 J = 17
@@ -155,7 +155,7 @@ def test_coco_categories_define_the_skeleton(tmp_path):
 
 
 def test_skeleton_by_count_by_name_or_given(tmp_path):
-    for count, name in ((18, "openpose18"), (26, "halpe26"), (16, "alphapose16")):
+    for count, name in ((18, "openpose18"), (26, "halpe26"), (16, "alphapose16"), (136, "halpe26")):
         content = [{"image_id": 0, "keypoints": [1.0] * 3 * count}]
         (track,) = read_keypoints(written(tmp_path, content), fps=1)
         assert track.skeleton == Skeleton.preset(name)
@@ -167,6 +167,53 @@ def test_skeleton_by_count_by_name_or_given(tmp_path):
     given = Skeleton([f"k{i}" for i in range(25)], [-1] * 25)
     assert read_keypoints(path, 1, given)[0].skeleton == given
     assert read_keypoints(path, 1, "body25")[0].skeleton == Skeleton.preset("body25")
+
+
+STANDING = {  # x right and y down, of a person who faces the camera
+    "nose": (0, 10), "neck": (0, 20), "head_top": (0, 0), "pelvis": (0, 55), "eye": (2, 8),
+    "ear": (5, 9), "shoulder": (12, 21), "elbow": (16, 38), "wrist": (18, 53), "hip": (7, 55),
+    "knee": (8, 75), "ankle": (8, 95), "big_toe": (10, 101), "small_toe": (13, 100),
+    "heel": (8, 98),
+}  # fmt: skip
+
+
+def standing(layout, turn, noise):
+    """Keypoints of a layout; ``turn`` -1 to 1 scales x, as a turn about the vertical does."""
+    points = []
+    for name in Skeleton.preset(layout).joint_names:
+        side, _, part = name.partition("_")
+        x, y = STANDING[part if side in ("left", "right") else name]
+        points.append((x * turn * (-1 if side == "right" else 1), y, 1))
+    return np.array(points) + noise * RNG.normal(size=(len(points), 3)) * [1, 1, 0]
+
+
+@pytest.mark.parametrize("layout", ["body25", "body25b"])
+@pytest.mark.parametrize("turn", [1, -1, 0.1])
+def test_25_keypoints_are_recognised_by_their_bones(tmp_path, layout, turn):
+    people = [standing(layout, turn, 1.5) for _ in range(5)]
+    for person in people:
+        person[RNG.choice(25, 5, replace=False)] = 0  # missing
+    path = written(tmp_path, [openpose(person) for person in people])
+    assert read_keypoints(path, 30)[0].skeleton == Skeleton.preset(layout)
+
+
+def test_other_orders_of_25_keypoints_are_ambiguous(tmp_path):
+    for _ in range(20):
+        person = standing("body25", 1, 1.5)[RNG.permutation(25)]
+        path = written(tmp_path, [openpose(person)])
+        with pytest.raises(MotionFileError, match="skeleton must be given for 25 keypoints"):
+            read_keypoints(path, 30)
+
+
+def test_layout_of_real_keypoints(real_data, tmp_path):
+    file = real_data / "originals/cam01.0050.json"
+    assert read_keypoints(file, 60)[0].skeleton == Skeleton.preset("body25b")
+    for path in sorted((real_data / "pose2sim_multiview").glob("*cam_0?.npz")):
+        (track,) = read_keypoints(path)
+        values = np.concatenate([track.keypoints, track.confidence[..., None]], axis=-1)
+        frames = [openpose(np.nan_to_num(person)) for person in values]
+        (again,) = read_keypoints(written(tmp_path, frames), 60)
+        assert again.skeleton == Skeleton.preset("body25b")
 
 
 ONE = result(0, FIRST[0])
@@ -195,6 +242,7 @@ def category(**more):
         ([ONE | {"image_id": 10**30}], "at most 18 digits"),
         ([ONE, ONE | {"image_id": 10**9}], "at most 500000 frames, got 0 to 1000000000"),
         ([ONE | {"keypoints": [1, 2]}], r"\[0\]: expected a list of x, y, conf.*, got \[1, 2\]"),
+        ([ONE | {"keypoints": [[1, 2, 1]] * 17}], "a list of x, y, confidence per keypoint"),
         ([ONE | {"keypoints": [True, 2, 3]}], "expected numbers between -1e9 and 1e9, got True"),
         ([ONE | {"keypoints": [1e300, 2, 1]}], r"expected numbers between .*, got 1e\+300"),
         ([ONE | {"keypoints": [1, 2, -1]}], "expected confidence of at least 0, got -1"),
@@ -236,8 +284,14 @@ def test_invalid_arguments_and_files_are_refused(tmp_path):
             {"fps": 1, "skeleton": "openpose18"},
             "expected 18 keypoints as in skeleton, got 17",
         ),
-        (tmp_path / "empty", {"fps": 1}, r"expected OpenPose \.json files"),
-        (tmp_path, {"fps": 1}, "expected an OpenPose frame with people, got"),
+        (path, {"image_size": (4, 3)}, "image_size must be None for COCO results, whose keypoint"),
+        (
+            path,
+            {"image_size": (4, 0)},
+            r"image_size \(height\) must be a finite number above 0, got",
+        ),
+        (tmp_path / "empty", {"fps": 1}, r"expected \.json files of OpenPose or MMPose"),
+        (tmp_path, {"fps": 1}, "expected a frame of OpenPose or MMPose, got"),
     ):
         with pytest.raises(ValueError, match=message):
             read_keypoints(source, **arguments)

@@ -5,9 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from probmotion.io.files import read_keypoints
-from probmotion.io.keypoint_linking import link_people
-from probmotion.io.keypoint_tracks import Detection
+from probmotion.io.keypoints.files import read_keypoints
+from probmotion.io.keypoints.tracks import Detection, link_people
 
 RNG = np.random.default_rng(0)
 BODY = RNG.random((17, 2)) * 40

@@ -1,10 +1,13 @@
 """DeepLabCut tables: tracks of one and several animals, and defects."""
 
+import pickle
+
+import h5py
 import numpy as np
 import pytest
 
 from probmotion.io.errors import MotionFileError
-from probmotion.io.files import read_keypoints
+from probmotion.io.keypoints.files import read_keypoints
 from probmotion.motion.skeleton import Skeleton
 
 SINGLE = """scorer,net,net,net,net,net,net
@@ -76,6 +79,137 @@ def test_labelled_images_have_confidence_one(tmp_path):
     np.testing.assert_array_equal(again.keypoints, run.keypoints)
 
 
+COLUMNS = [
+    ("net", animal, part, coordinate)
+    for animal in ("mouse2", "mouse1")
+    for part in ("snout", "tail_base")
+    for coordinate in ("x", "y", "likelihood")
+]
+CELLS = np.random.default_rng(8).uniform(0.1, 1, size=(3, 12))
+CELLS[1, 3:5] = np.nan
+
+
+def appendable(folder, columns=COLUMNS, cells=CELLS, kind=None):
+    """Write pandas' format "table", that of analysed videos."""
+    with h5py.File(folder / "table.h5", "w") as file:
+        group = file.create_group("df_with_missing")
+        group.attrs["pandas_type"] = np.bytes_("frame_table")
+        dtype = [("index", "<i8"), ("values_block_0", "<f8", cells.shape[1:])]
+        rows = np.zeros(len(cells), dtype)
+        rows["index"], rows["values_block_0"] = np.arange(len(cells)), cells
+        table = group.create_dataset("table", data=rows, maxshape=(None,))
+        kind = pickle.dumps(columns, protocol=0) if kind is None else kind
+        table.attrs["values_block_0_kind"] = np.bytes_(kind)
+    return folder / "table.h5"
+
+
+def fixed(folder, columns=COLUMNS, cells=CELLS, index=None, **changes):
+    """Write pandas' format "fixed", that of labelled images."""
+    with h5py.File(folder / "table.h5", "w") as file:
+        group = file.create_group("df_with_missing")
+        group.attrs.update({"pandas_type": np.bytes_("frame"), "nblocks": 1})
+        group["block0_values"] = cells
+        levels = (
+            {"block0_items": columns}
+            if index is None
+            else {"block0_items": columns} | {"axis1": index}
+        )
+        for name, entries in levels.items():
+            group.attrs[f"{name}_nlevels"] = len(entries[0])
+            for k, level in enumerate(zip(*entries, strict=True)):
+                texts, codes = np.unique(np.array(level, dtype="S"), return_inverse=True)
+                group[f"{name}_level{k}"], group[f"{name}_label{k}"] = texts, codes.astype("i1")
+        if index is None:
+            group["axis1"] = np.arange(len(cells))
+        for key, value in changes.items():
+            del group[key]
+            group[key] = value
+    return folder / "table.h5"
+
+
+@pytest.mark.parametrize("write", [appendable, fixed])
+def test_hdf5_tables_of_several_animals_and_of_one(tmp_path, write):
+    two, one = read_keypoints(write(tmp_path), fps=50)
+    assert (two.name, one.name, two.fps) == ("table mouse2", "table mouse1", 50)
+    assert two.skeleton == Skeleton(["snout", "tail_base"], [-1, -1])
+    np.testing.assert_array_equal(two.keypoints[:, 0], CELLS[:, :2])
+    np.testing.assert_array_equal(two.keypoints[:, 1], CELLS[:, 3:5])
+    np.testing.assert_array_equal(two.confidence[:, 1], [CELLS[0, 5], 0, CELLS[2, 5]])
+    np.testing.assert_array_equal(one.keypoints[:, 1], CELLS[:, 9:11])
+    columns = [(scorer, *rest) for scorer, _, *rest in COLUMNS[:6]]
+    (single,) = read_keypoints(write(tmp_path, columns, CELLS[:, :6]), fps=50)
+    assert single.name == "table"
+    np.testing.assert_array_equal(single.keypoints, two.keypoints)
+    (chosen,) = read_keypoints(tmp_path / "table.h5", 50, Skeleton(["tail_base"], [-1]))
+    np.testing.assert_array_equal(chosen.keypoints[:, 0], two.keypoints[:, 1])
+
+
+def test_hdf5_tables_of_labelled_images(tmp_path):
+    index = [("labeled-data", "run", f"img{k:03}.png") for k in (3, 5, 6)]
+    columns = [("me", part, axis) for part in ("snout", "tail") for axis in "xy"]
+    (track,) = read_keypoints(fixed(tmp_path, columns, CELLS[:, 6:10], index), fps=50)
+    np.testing.assert_array_equal(track.keypoints[[0, 2, 3], 0], CELLS[:, 6:8])
+    np.testing.assert_array_equal(track.confidence[:, 0], [1, 0, 1, 1])
+
+
+class Trap:
+    """An object whose unpickling creates a file."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return (type(self.path).touch, (self.path,))
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        (b"", "expected columns of strings, got b''; save it as .csv"),
+        (pickle.dumps(COLUMNS, protocol=0)[:-1], "expected columns of strings"),
+        (pickle.dumps(COLUMNS, protocol=4), "expected columns of strings"),
+        (pickle.dumps([*COLUMNS[1:], (1, 2, 3)], protocol=0), "expected columns of strings"),
+        (
+            pickle.dumps(COLUMNS[1:], protocol=0),
+            r"expected 3 rows of 11 cells, got shape \(3, 12\)",
+        ),
+        (pickle.dumps([("a", "b")] * 12, protocol=0), "expected columns of scorer, indiv.* got"),
+        (pickle.dumps([("a", "b", "y")] * 12, protocol=0), "x, y and likelihood once for each"),
+    ],
+)
+def test_damaged_columns_of_hdf5_tables(tmp_path, kind, message):
+    with pytest.raises(MotionFileError, match=message):
+        read_keypoints(appendable(tmp_path, kind=kind), 50)
+
+
+def test_pickles_in_hdf5_tables_are_not_loaded(tmp_path):
+    marker = tmp_path / "marker"
+    kind = pickle.dumps([*COLUMNS[:-1], Trap(marker)], protocol=0)
+    with pytest.raises(MotionFileError, match="expected columns of strings"):
+        read_keypoints(appendable(tmp_path, kind=kind), 50)
+    assert not marker.exists()
+    pickle.loads(kind)
+    assert marker.exists()  # the trap works
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"cells": CELLS[:0]}, "expected a row per frame, got none"),
+        ({"cells": CELLS * 1e12}, "expected numbers between -1e9 and 1e9 in all cells|be between"),
+        ({"cells": -CELLS}, "row 0, column 3: expected a likelihood of at least 0, got -0."),
+        ({"block0_items_label1": np.full(12, 9)}, "expected codes of 2 names in block0_items"),
+        ({"block0_items_label1": np.zeros(3)}, "expected levels of equal length in block0_items"),
+        ({"axis1": np.arange(9)}, "expected 9 rows of 12 cells, got shape"),
+        ({"axis1": -np.arange(3)}, "row 1: expected a frame number or an image path, got '-1'"),
+        ({"block0_values": np.array([b"a"])}, "block0_values must contain numbers with 2 axes"),
+    ],
+)
+def test_damaged_hdf5_tables(tmp_path, changes, message):
+    with pytest.raises(MotionFileError, match=message):
+        read_keypoints(fixed(tmp_path, **changes), 50)
+
+
 def test_skeleton_selects_joints_by_own_or_canonical_names(tmp_path):
     text = SINGLE.replace("snout", "L_ankle").replace("tail_base", "right_ankle")
     path = written(tmp_path, text)
@@ -128,7 +262,7 @@ def test_defects_are_reported(tmp_path, old, new, message):
         (SINGLE, "a.csv", {"people": 1}, "people must be None for .csv files, got 1"),
         (SINGLE, "a.csv", {"skeleton": "coco17"}, "the joint 'nose' .* body parts of the table"),
         (SEVERAL, "a.csv", {"skeleton": Skeleton(["corner"], [-1])}, "of individual 'mouse2'"),
-        ("", "a.h5", {}, "expected a CSV table, got HDF5"),
+        ("", "a.h5", {}, "expected a readable HDF5 file"),
     ],
 )
 def test_invalid_arguments_are_refused(tmp_path, content, name, changes, message):

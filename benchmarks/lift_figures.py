@@ -1,0 +1,116 @@
+"""Accuracy of lifts of made videos of held-out clips, for ``accuracy.py lift``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from probmotion.data.denoising_clips import denoising_clips
+from probmotion.data.synthetic.gaits import make_gait
+from probmotion.data.videos import Video, film, quadruped_as_person
+from probmotion.io.files import load
+from probmotion.lifting import Lift, lift
+from probmotion.motion.motion import Motion
+from probmotion.motion.skeleton import Skeleton
+
+PERSON = Skeleton.preset("person14")
+SEEN = [j for j, name in enumerate(PERSON.joint_names) if name not in ("pelvis", "neck")]
+HIPS = [PERSON.joint_names.index(f"{side}_hip") for side in ("left", "right")]
+WALKS = ("cmu_02_02", "humanoid3d_long_walk3")
+FRAMES, VIEWS = 150, 4  # of each clip
+HEIGHTS = (1.0, 2.2)  # of the cameras, metres
+MADE = 15  # videos of each kind that must be flagged
+
+
+def lift_figures(folder: Path) -> Iterator[tuple[str, float]]:
+    """Yield the figures; medians over videos, coverages are means."""
+    rows: dict[str, list[tuple[float, float, float]]] = {"walk": [], "other": []}
+    flagged = []
+    for number, clip in enumerate(held_out(folder)):
+        for view in range(VIEWS):
+            # Eight azimuths and two heights in turn.
+            turn = (2 * view + number) % 8
+            video = film(clip, number, azimuth=turn * np.pi / 4, height=HEIGHTS[view % 2])
+            result = lifted(video)
+            kind = "walk" if clip.name.startswith(WALKS) else "other"
+            rows[kind].append(errors(result, video))
+            flagged.append(not result.trusted)
+    walk, every = (np.array(rows["walk"]), np.array(rows["walk"] + rows["other"]))
+    yield "lift_walk_mpjpe_mm", float(np.median(walk[:, 0]))
+    yield "lift_all_mpjpe_mm", float(np.median(every[:, 0]))
+    yield "lift_walk_coverage_90", float(walk[:, 1].mean())
+    yield "lift_all_coverage_90", float(every[:, 1].mean())
+    yield "lift_root_error", float(np.median(every[:, 2]))
+    yield "lift_flagged_good", float(np.mean(flagged))
+    bad = bad_videos(folder)
+    marks = {kind: [not lifted(video).trusted for video in videos] for kind, videos in bad.items()}
+    for kind, values in marks.items():
+        yield f"lift_flagged_{kind}", float(np.mean(values))
+    yield "lift_flagged_bad", float(np.mean(list(marks.values())))
+
+
+def held_out(folder: Path) -> list[Motion]:
+    """Return excerpts of test clips and of the action that the prior has not seen."""
+    clips = denoising_clips(folder)["test"]
+    clips += [load(path) for path in sorted((folder / "cmu_actions").glob("soccer*.npz"))]
+    moving = [clip.retarget(PERSON).resample(30.0) for clip in clips]
+    return [clip.window(0, min(FRAMES, clip.frames)) for clip in moving if clip.frames >= 60]
+
+
+def lifted(video: Video) -> Lift:
+    """Return the lift of a video."""
+    return lift(video.track, image_size=video.size, progress=False)
+
+
+def errors(result: Lift, video: Video) -> tuple[float, float, float]:
+    """Return mean joint error (mm), coverage of 90 % intervals, and relative error of the path.
+
+    Joints are the twelve keypoints relative to the middle of the hips.
+    """
+    truth = video.motion.positions
+    distance = np.linalg.norm(about_hips(result.mean.positions) - about_hips(truth), axis=-1)
+    low, high = np.quantile(about_hips(result.draws), [0.05, 0.95], axis=0)
+    inside = (about_hips(truth) >= low) & (about_hips(truth) <= high)
+    path, true_path = (x[:, 0, [0, 2]] for x in (result.mean.positions, truth))
+    off = np.linalg.norm(path - true_path, axis=-1).mean()
+    return 1000 * distance.mean(), inside.mean(), off / np.linalg.norm(true_path, axis=-1).mean()
+
+
+def about_hips(positions: np.ndarray) -> np.ndarray:
+    """Return the keypoints' positions relative to the middle of the hips."""
+    return (positions - positions[..., HIPS, :].mean(axis=-2, keepdims=True))[..., SEEN, :]
+
+
+def bad_videos(folder: Path) -> dict[str, list[Video]]:
+    """Return videos that no person filmed by a still camera explains."""
+    clips = [clip for clip in held_out(folder) if clip.frames >= 90]
+    kinds: dict[str, list[Video]] = {
+        kind: [] for kind in ("random", "animal", "mirrored", "moving_camera")
+    }
+    for number in range(MADE):
+        rng = np.random.default_rng(number)
+        clip = clips[number % len(clips)].window(0, 90)
+        video = film(clip, number, azimuth=rng.uniform(0, 2 * np.pi), height=1.0)
+        points, size = video.track.keypoints, video.size[0]
+        kinds["random"].append(with_points(video, rng.uniform(0.2, 0.8, points.shape) * size))
+        flipped = points.copy()
+        flipped[..., 0] = size - flipped[..., 0]
+        kinds["mirrored"].append(with_points(video, flipped))
+        times = np.arange(len(points)) / clip.fps
+        pan = rng.uniform(60, 150) * np.sin(2 * np.pi * rng.uniform(0.3, 1) * times + number)
+        shifted = points + np.stack([pan, 0.5 * pan], axis=-1)[:, None]
+        kinds["moving_camera"].append(with_points(video, np.clip(shifted, 0, size - 1)))
+        # The fore legs of quadrupeds have the names of arms.
+        gait = make_gait(("quadruped-walk", "quadruped-trot")[number % 2], number, frames=90)
+        gait = quadruped_as_person(gait)
+        kinds["animal"].append(film(gait, number, azimuth=number, height=0.8))
+    return kinds
+
+
+def with_points(video: Video, points: np.ndarray) -> Video:
+    """Return the video with other keypoints where it has some."""
+    kept = np.where(video.track.confidence[..., None] > 0, points, np.nan)
+    return video._replace(track=replace(video.track, keypoints=kept))

@@ -1,0 +1,174 @@
+"""Writer of binary glTF 2.0 files (GLB): an animated, skinned body.
+
+Source: The Khronos Group, *glTF 2.0 specification* (2021).
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from probmotion.files import written_whole
+from probmotion.geometry.rotations import matrix_to_quaternion
+from probmotion.io._body_mesh import body_mesh
+from probmotion.motion.inverse_kinematics import rigid_motion
+from probmotion.motion.motion import Motion
+from probmotion.motion.rest_poses import joint_positions
+
+__all__ = ["write_glb"]
+
+_FLOAT, _SHORT, _INT = 5126, 5123, 5125  # component types
+_VERTICES, _INDICES = 34962, 34963  # buffer view targets
+_COMPONENTS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
+_COLOUR = [0.42, 0.53, 0.68, 1.0]
+
+
+def write_glb(motion: Motion, path: str | Path) -> None:
+    """Write a motion to a GLB file, in metres and atomically.
+
+    The file contains a skeleton of rigid bones, an animation with a rotation of every joint and a
+    translation of every root, and a body of capsules that moves with the skeleton. The bind pose is
+    the rest pose, with its feet at height 0. ``extras`` of the animation contain ``fps``. A motion
+    without rotations is converted as by :func:`~probmotion.io.bvh_writing.write_bvh`.
+
+    Raises
+    ------
+    OSError
+        If the folder is missing or not writable.
+
+    Warns
+    -----
+    UserWarning
+        If the positions cannot be reproduced by rigid bones.
+    """
+    motion = rigid_motion(motion)
+    skeleton, roots = motion.skeleton, list(motion.skeleton.roots)
+    offsets = np.array(motion.rest_offsets)
+    offsets[roots] = motion.positions[0, roots] * [1.0, 0.0, 1.0]
+    offsets[roots, 1] -= body_mesh(skeleton, _rest(motion, offsets)).vertices[:, 1].min()
+    rest = _rest(motion, offsets)
+    buffer = _Buffer()
+    bind = np.tile(np.eye(4), (skeleton.n_joints, 1, 1))
+    bind[:, 3, :3] = -rest  # transposed: glTF stores matrices column by column
+    primitive = _primitive(buffer, motion, rest)
+    binds = buffer.add(bind.reshape(-1, 16), _FLOAT)
+    animation = _animation(buffer, motion)
+    nodes: list[dict[str, Any]] = []
+    for joint, name in enumerate(skeleton.joint_names):
+        node = {"name": name, "translation": offsets[joint].tolist()}
+        children = [child for child, parent in skeleton.bones if parent == joint]
+        nodes.append({**node, "children": children} if children else node)
+    top = len(nodes)
+    nodes += [{"name": "skeleton", "children": roots}, {"name": "body", "mesh": 0, "skin": 0}]
+    content = {
+        "asset": {"version": "2.0", "generator": "probmotion"},
+        "scene": 0,
+        "scenes": [{"nodes": [top, top + 1]}],
+        "nodes": nodes,
+        "meshes": [{"name": "body", "primitives": [primitive]}],
+        "materials": [
+            {
+                "name": "body",
+                "pbrMetallicRoughness": {
+                    "baseColorFactor": _COLOUR,
+                    "metallicFactor": 0.0,
+                    "roughnessFactor": 0.7,
+                },
+            }
+        ],
+        "skins": [{"inverseBindMatrices": binds, "skeleton": top, "joints": list(range(top))}],
+        "animations": [animation],
+        "accessors": buffer.accessors,
+        "bufferViews": buffer.views,
+        "buffers": [{"byteLength": len(buffer.data)}],
+    }
+    text = json.dumps(content, separators=(",", ":")).encode()
+    chunks = b"".join(
+        struct.pack("<I4s", len(chunk), kind) + chunk
+        for kind, chunk in (
+            (b"JSON", text + b" " * (-len(text) % 4)),
+            (b"BIN\0", bytes(buffer.data)),
+        )
+    )
+    with written_whole(Path(path)) as unfinished:
+        unfinished.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+
+
+class _Buffer:
+    """Binary data with its accessors and views."""
+
+    def __init__(self) -> None:
+        self.data = bytearray()
+        self.views: list[dict[str, int]] = []
+        self.accessors: list[dict[str, Any]] = []
+
+    def add(
+        self, values: np.ndarray, kind: int, target: int | None = None, bounds: bool = False
+    ) -> int:
+        """Append an array (n, components) and return the index of its accessor."""
+        dtype = {_FLOAT: "<f4", _SHORT: "<u2", _INT: "<u4"}[kind]
+        array = np.ascontiguousarray(values, dtype=dtype)
+        view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": array.nbytes}
+        self.views.append(view if target is None else {**view, "target": target})
+        accessor = {
+            "bufferView": len(self.views) - 1,
+            "componentType": kind,
+            "count": len(array),
+            "type": _COMPONENTS[array.shape[1]],
+        }
+        if bounds:
+            accessor |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
+        self.accessors.append(accessor)
+        self.data += array.tobytes()
+        self.data += bytes(-len(self.data) % 4)
+        return len(self.accessors) - 1
+
+
+def _rest(motion: Motion, offsets: np.ndarray) -> np.ndarray:
+    """Return the joint positions (J, 3) of the rest pose with the roots at their offsets."""
+    rest = joint_positions(motion.skeleton, offsets)
+    for root in motion.skeleton.roots:
+        below = [j for j in range(len(rest)) if j == root or root in motion.skeleton.ancestors(j)]
+        rest[below] += offsets[root]
+    return rest
+
+
+def _primitive(buffer: _Buffer, motion: Motion, rest: np.ndarray) -> dict[str, Any]:
+    mesh = body_mesh(motion.skeleton, rest)
+    weights = mesh.weights.astype(np.float32)
+    weights[:, 0] = 1 - weights[:, 1:].sum(axis=1)
+    attributes = {
+        "POSITION": buffer.add(mesh.vertices, _FLOAT, _VERTICES, bounds=True),
+        "NORMAL": buffer.add(mesh.normals, _FLOAT, _VERTICES),
+        "JOINTS_0": buffer.add(mesh.joints, _SHORT, _VERTICES),
+        "WEIGHTS_0": buffer.add(weights, _FLOAT, _VERTICES),
+    }
+    indices = buffer.add(mesh.triangles.reshape(-1, 1), _INT, _INDICES)
+    return {"attributes": attributes, "indices": indices, "material": 0}
+
+
+def _animation(buffer: _Buffer, motion: Motion) -> dict[str, Any]:
+    quaternions = np.roll(matrix_to_quaternion(motion.rotations), -1, axis=-1)  # x, y, z, w
+    # Viewers interpolate between successive quaternions, which must have the same sign.
+    agree = (quaternions[1:] * quaternions[:-1]).sum(axis=-1) >= 0
+    quaternions[1:] *= np.cumprod(np.where(agree, 1.0, -1.0), axis=0)[..., None]
+    times = buffer.add(np.arange(motion.frames)[:, None] / motion.fps, _FLOAT, bounds=True)
+    outputs = [
+        (joint, "rotation", quaternions[:, joint]) for joint in range(motion.skeleton.n_joints)
+    ]
+    outputs += [(root, "translation", motion.positions[:, root]) for root in motion.skeleton.roots]
+    return {
+        "name": motion.name or "motion",
+        "extras": {"fps": motion.fps},
+        "samplers": [
+            {"input": times, "output": buffer.add(values, _FLOAT)} for _, _, values in outputs
+        ],
+        "channels": [
+            {"sampler": index, "target": {"node": node, "path": path}}
+            for index, (node, path, _) in enumerate(outputs)
+        ],
+    }

@@ -1,0 +1,2 @@
+from .files import open_keypoints as open_keypoints, read_keypoints as read_keypoints
+from .tracks import KeypointFile as KeypointFile

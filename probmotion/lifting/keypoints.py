@@ -1,0 +1,153 @@
+"""Keypoints of a detector on the joints of the prior, with swapped sides repaired."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from probmotion.motion.motion import KeypointTrack
+from probmotion.motion.retargeting import counterpart
+from probmotion.motion.skeleton import Skeleton
+
+__all__ = ["PersonKeypoints", "averaged", "body_depth", "person_keypoints"]
+
+PERSON = Skeleton.preset("person14")
+# Neck and pelvis of detectors are midpoints of shoulders and hips, which motion capture has not.
+_TRUNK = ("neck", "pelvis")
+LIMBS = [j for j, name in enumerate(PERSON.joint_names) if name not in _TRUNK]
+"""Joints of arms and legs."""
+_GROUPS = (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"))
+_SWAP_COST = 0.05  # of a frame with exchanged sides, in units of a frame's typical motion
+_CAPPED = 5.0  # largest cost of one joint in a step, in the same units
+_LIMBS = {"elbow": 0.28, "wrist": 0.21, "knee": 0.42, "ankle": 0.41}  # bone lengths, metres
+_SPREAD = 0.1  # of the logarithm of a frame's size
+
+
+class PersonKeypoints(NamedTuple):
+    """Keypoints of ``person14``.
+
+    ``points``, (L, 14, 2), pixels, 0 where missing; ``weight``, (L, 14), multiplier of the
+    precision; ``swapped``, share of limbs whose sides were exchanged.
+    """
+
+    points: np.ndarray
+    weight: np.ndarray
+    swapped: float
+
+
+def person_keypoints(track: KeypointTrack) -> PersonKeypoints:
+    """Return a track's keypoints of arms and legs; raises ``ValueError`` if there are too few."""
+    source = track.skeleton
+    names = PERSON.joint_names
+    same = source == PERSON
+    found = [
+        None
+        if name in _TRUNK and not same
+        else counterpart(source, name, PERSON.canonical_names[joint])
+        for joint, name in enumerate(names)
+    ]
+    lacking = [name for name, joint in zip(names, found, strict=True) if joint is None]
+    lacking = [name for name in lacking if name not in _TRUNK]
+    if lacking:
+        raise ValueError(
+            f"track must have shoulders, elbows, wrists, hips, knees and ankles, got "
+            f"{source.n_joints} keypoints without {', '.join(lacking)}; name the layout with "
+            "skeleton"
+        )
+    points = np.zeros((track.frames, len(names), 2))
+    weight = np.zeros(points.shape[:2])
+    for joint, origin in enumerate(found):
+        if origin is not None:
+            seen = track.confidence[:, origin] > 0
+            points[seen, joint] = track.keypoints[seen, origin]
+            weight[:, joint] = np.minimum(track.confidence[:, origin], 1.0)
+    return _unswapped(points, weight)
+
+
+def _unswapped(points: np.ndarray, weight: np.ndarray) -> PersonKeypoints:
+    """Return keypoints whose left and right limbs do not jump to the other side.
+
+    For arms and legs, the cheapest sequence of ordinary and exchanged frames (Viterbi) has the
+    smallest sum of joints' steps between frames.
+    """
+    points, weight = points.copy(), weight.copy()
+    swapped = []
+    for group in _GROUPS:
+        left, right = (
+            [PERSON.joint_names.index(f"{side}_{name}") for name in group]
+            for side in ("left", "right")
+        )
+        both = [left + right, right + left]
+        costs = np.empty((2, 2, len(points) - 1))
+        for i, before in enumerate(both):
+            for j, after in enumerate(both):
+                step = np.linalg.norm(points[1:, after] - points[:-1, before], axis=-1)
+                known = (weight[1:, after] > 0) & (weight[:-1, before] > 0)
+                costs[i, j] = np.where(known, step, 0.0).sum(axis=1)
+        typical = np.median(costs[0, 0]) if len(points) > 1 else 0.0
+        costs = np.minimum(costs / max(typical, 1e-9), _CAPPED)
+        exchanged = _cheapest(costs)
+        for frame in np.flatnonzero(exchanged):
+            points[frame, left + right] = points[frame, right + left]
+            weight[frame, left + right] = weight[frame, right + left]
+        swapped.append(exchanged.mean())
+    return PersonKeypoints(points, weight, float(np.mean(swapped)))
+
+
+def _cheapest(costs: np.ndarray) -> np.ndarray:
+    """Return which frames are exchanged, (L,), for costs (2, 2, L − 1) of steps."""
+    frames = costs.shape[2] + 1
+    total = np.array([0.0, _SWAP_COST])
+    origins = np.zeros((frames, 2), dtype=int)
+    for frame in range(1, frames):
+        ways = total[:, None] + costs[:, :, frame - 1]
+        origins[frame] = ways.argmin(axis=0)
+        total = ways.min(axis=0) + np.array([0.0, _SWAP_COST])
+    state = int(total.argmin())
+    out = np.zeros(frames, dtype=bool)
+    for frame in range(frames - 1, -1, -1):
+        out[frame] = bool(state)
+        state = origins[frame, state]
+    return out
+
+
+def averaged(keypoints: PersonKeypoints, step: int) -> PersonKeypoints:
+    """Return weighted means of every ``step`` frames; an incomplete last group is left out."""
+    n = len(keypoints.points) // step
+    joints = keypoints.weight.shape[1]
+    weight = keypoints.weight[: n * step].reshape(n, step, joints)
+    points = keypoints.points[: n * step].reshape(n, step, joints, 2)
+    total = weight.sum(axis=1)
+    mean = (weight[..., None] * points).sum(axis=1) / np.maximum(total, 1e-12)[..., None]
+    return PersonKeypoints(mean, total, keypoints.swapped)
+
+
+def body_depth(points: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return the distance of a body from the camera over its focal length, (L,).
+
+    In every frame some bone is nearly parallel to the image. The logarithm of the largest ratio of
+    a bone's size in the image to its length is fitted by a straight line over time, robustly.
+    """
+    ratios = np.zeros((len(points), 0))
+    for joint, name in enumerate(PERSON.joint_names):
+        length = _LIMBS.get(name.rpartition("_")[2])
+        if length is None:
+            continue
+        parent = PERSON.parents[joint]
+        size = np.linalg.norm(points[:, joint] - points[:, parent], axis=-1) / length
+        known = (weight[:, joint] > 0) & (weight[:, parent] > 0)
+        ratios = np.column_stack([ratios, np.where(known, size, 0.0)])
+    # The second largest is safe from one outlier.
+    size = np.sort(ratios, axis=1)[:, -2]
+    rows = np.flatnonzero(size > 0)
+    times = np.arange(len(points)) - (len(points) - 1) / 2
+    if len(rows) < 2:
+        raise ValueError("keypoints must have visible limbs in two frames, got fewer")
+    logs, robust = np.log(size[rows]), np.ones(len(rows))
+    slope, level = 0.0, float(np.median(logs))
+    for _ in range(10):
+        slope, level = np.polyfit(times[rows], logs, 1, w=np.sqrt(robust))
+        robust = 1 / (1 + ((logs - slope * times[rows] - level) / _SPREAD) ** 2)
+    depth: np.ndarray = np.exp(-(slope * times + level))
+    return depth

@@ -1,0 +1,99 @@
+"""Page of a lift: summary, keypoints, and draws in motion. It is self-contained."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+
+import numpy as np
+
+from probmotion.comparison.results.stored_problems import StoredProblem
+from probmotion.geometry.cameras import Cameras
+from probmotion.lifting.checks import Check
+from probmotion.motion.motion import Motion
+from probmotion.plots.animation import animation_html, animation_script, animation_style
+from probmotion.plots.motion_data import Shown
+
+__all__ = ["lift_page"]
+
+_DRAWS = 24  # draws from which the page computes standard deviations
+_FRAMES = 450  # most frames of the animation
+_STYLE = """
+body { margin: 0 auto; max-width: 60rem; padding: 1rem; font: 1rem/1.5 system-ui, sans-serif;
+  color: #222; background: #fff; --ink: #222; --quiet: #666; }
+h1 { font-size: 1.4rem; } .quiet { color: #666; }
+.bad { border-left: .4rem solid #c00; padding-left: .8rem; }
+.good { border-left: .4rem solid #0a7d33; padding-left: .8rem; }
+table { border-collapse: collapse; } td, th { padding: .15rem .8rem .15rem 0; text-align: left; }
+td:nth-child(n + 2) { font-variant-numeric: tabular-nums; }
+"""
+
+
+def lift_page(
+    motion: Motion,
+    draws: np.ndarray,
+    cameras: Cameras,
+    keypoints: np.ndarray,
+    checks: Sequence[Check],
+    sentences: Sequence[str],
+) -> str:
+    """Return the page as HTML.
+
+    Parameters
+    ----------
+    motion : Motion
+        Posterior mean.
+    draws : ndarray, (n, L, J, 3)
+        Posterior draws, metres.
+    cameras : Cameras
+        The camera.
+    keypoints : ndarray, (L, J, 2)
+        Keypoints, pixels; NaN where missing.
+    checks : sequence of Check
+    sentences : sequence of str
+        Summary.
+    """
+    name = motion.name or "motion"
+    step = max(1, -(-motion.frames // _FRAMES))
+    # Spread about a common root: the distance from the camera would hide that of the pose.
+    shown_draws = draws[:_DRAWS] - draws[:_DRAWS, :, :1] + motion.positions[None, :, :1]
+    problem = StoredProblem(motion.skeleton, motion.fps, True, camera=cameras, keypoints=keypoints)
+    rows = {"lift": np.concatenate([motion.positions[None], shown_draws])}
+    shown = Shown(problem, rows, step, overlaid=True)
+    captions = {"lift": "mean and three draws; joints coloured by their standard deviation"}
+    animation = animation_html(name, shown, captions)
+    table = "\n".join(
+        f"<tr><td>{escape(check.name)}</td><td>{check.value:.3g}</td><td>{check.limit:.3g}</td>"
+        f"<td>{'passed' if check.passed else escape(check.problem)}</td></tr>"
+        for check in checks
+    )
+    mark = "good" if all(check.passed for check in checks) else "bad"
+    summary = "".join(f"<p>{escape(sentence)}</p>" for sentence in sentences)
+    title = escape(f"{name}: 3D motion from one camera")
+    # The policy blocks external resources.
+    policy = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+    return f"""\
+<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="{policy}">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{title}</title>
+<style>{animation_style()}{_STYLE}</style>
+</head>
+<body>
+<h1>{title}</h1>
+<div class="{mark}">{summary}</div>
+{animation}
+<h2>Checks</h2>
+<table>
+<tr><th>check</th><th>value</th><th>at most</th><th>result</th></tr>
+{table}
+</table>
+<script>
+document.querySelectorAll(".animation").forEach({animation_script()});
+</script>
+</body>
+</html>
+"""

@@ -1,0 +1,400 @@
+"""Posterior of a window of motion given the keypoints of one camera.
+
+The prior is a mixture of Gaussians, the camera a pinhole camera, and the noise Student-t. For each
+probable component and heading, the projection is linearised at the current mean (Gauss-Newton) and
+outliers have smaller weights, the expected precisions of the scale mixture. Bones have constant
+lengths: |X_j − X_parent| = l_j (1 + δ_j) ± 1 cm with one unknown δ_j for the window.
+
+Distances to the camera are hardly observed, and the density of all coefficients is largest at a
+motion that is too close and too small: closer motions need smaller deviations from the mean. The
+mode of the marginal density has no such bias. By Laplace's approximation its logarithm has the
+additional term −½ log det H, with the precision H of the coefficients. As a keypoint's information
+is proportional to 1/depth², the gradient of this term is its leverage over depth: a force on each
+joint away from the camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.ndimage import median_filter
+
+from probmotion.lifting.camera import LevelCamera
+from probmotion.lifting.window_prior import WindowPrior
+from probmotion.models.mixture.conditioning import rotation
+
+__all__ = ["Observed", "WindowMode", "WindowPosterior", "lift_window"]
+
+FREEDOM = 4.0  # degrees of freedom of the keypoints' noise
+_BONE_NOISE = 0.01  # standard deviation of a bone's length between frames, metres
+_PROPORTIONS = 0.03  # relative standard deviation of a bone's length between people
+_HEIGHT = 0.3  # standard deviation of the floor's height relative to the camera, metres
+_JOIN_NOISE = 0.01  # standard deviation with which draws continue earlier ones, metres
+_ROUNDS = 4  # of the linearisation
+_SCREENED = 40.0  # nats below the best component at which others are left out
+_NEAR = 2  # headings of one component that are this close are one candidate
+_WIDE = 3.0  # factor of the noise in the first round
+_SMALL = 1e-4  # probability of modes that are left out
+# Chosen on validation clips, since motion unlike the clips makes the exact posterior too narrow:
+# power of the modes' probabilities, and factor of standard deviations.
+_TEMPER, _INFLATION = 0.03, 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """Keypoints of a window.
+
+    Parameters
+    ----------
+    points : ndarray, (L, J, 2)
+        Normalised image coordinates (right, up); 0 where missing.
+    weight : ndarray, (L, J)
+        Multiplier of the precision; 0 where missing.
+    noise : float
+        Scale of the noise of a keypoint of weight 1, pixels.
+    """
+
+    points: np.ndarray
+    weight: np.ndarray
+    noise: float
+
+
+@dataclass(frozen=True, eq=False)
+class WindowMode:
+    """Gaussian approximation of the posterior near one mode.
+
+    ``score`` is its log posterior mass up to a constant. ``mean``, (q,), and ``lower``, (q, q), are
+    the mean and the Cholesky factor of the precision of standardised coefficients: those of the
+    component, then the floor's height and the camera's pitch, then the proportions. ``positions``,
+    (L, J, 3), are those of the mean, metres, and ``standardised``, (L, J), squared residuals in
+    units of the noise. ``pitch`` is that of the camera, radians.
+    """
+
+    score: float
+    component: int
+    yaw: int
+    scale: float
+    mean: np.ndarray
+    lower: np.ndarray
+    positions: np.ndarray
+    standardised: np.ndarray
+    pitch: float
+
+
+class _Gaussian:
+    """One component at one heading and scale, linear in standardised coefficients."""
+
+    def __init__(self, prior: WindowPrior, k: int, yaw: int, scale: float) -> None:
+        part = prior.component(k)
+        self.part, self.rotation = part, rotation(prior.yaws[yaw])
+        self.deviation = np.sqrt(part.variance * np.where(part.ground, 1.0, scale))
+
+    def positions(self, prior: WindowPrior, k: int, z: np.ndarray, times: np.ndarray) -> np.ndarray:
+        """Return the motions of coefficients: ``(n, q), (T,) → (n, T, J, 3)``, about the origin."""
+        part, r = self.part, len(self.deviation)
+        J = part.directions.shape[0]
+        cosines = prior.cosines(times)[:, part.frequency]  # (T, r)
+        scores = z[:, :r] * self.deviation
+        flat = (scores[:, None, :] * cosines) @ part.directions.reshape(3 * J, r).T
+        motions = flat.reshape(len(z), len(times), J, 3) + prior.mean_at(k, times)
+        turned: np.ndarray = motions @ self.rotation.T
+        turned[..., 1] += _HEIGHT * z[:, r, None, None]
+        return turned
+
+    def design(self, prior: WindowPrior, times: np.ndarray) -> np.ndarray:
+        """Return d positions / d coefficients at times, (T J 3, q)."""
+        part, r = self.part, len(self.deviation)
+        J = part.directions.shape[0]
+        cosines = prior.cosines(times)[:, part.frequency] * self.deviation
+        turned = np.tensordot(self.rotation, part.directions, axes=(1, 1)).swapaxes(0, 1)
+        out = np.zeros((len(times), J, 3, r + 2 + len(prior.children)))
+        out[..., :r] = turned * cosines[:, None, None, :]
+        out[:, :, 1, r] = _HEIGHT
+        return out.reshape(len(times) * J * 3, -1)
+
+
+@dataclass(frozen=True, eq=False)
+class WindowPosterior:
+    """Mixture of modes of one window; positions are relative to the camera, metres."""
+
+    prior: WindowPrior
+    origin: np.ndarray
+    modes: tuple[WindowMode, ...]
+
+    @property
+    def probabilities(self) -> np.ndarray:
+        """Probabilities of the modes."""
+        scores = np.array([mode.score for mode in self.modes])
+        weights = np.exp(_TEMPER * (scores - scores.max()))
+        return weights / weights.sum()
+
+    @property
+    def best(self) -> WindowMode:
+        """The most probable mode."""
+        return max(self.modes, key=lambda mode: mode.score)
+
+    def floor(self, mode: WindowMode) -> float:
+        """Return the height of the floor relative to the window's origin, metres."""
+        return float(_HEIGHT * mode.mean[len(self.prior.component(mode.component).variance)])
+
+    def mean(self, times: np.ndarray) -> np.ndarray:
+        """Return the posterior mean at times in frames of the window, (T, J, 3)."""
+        parts = [
+            p * self._gaussian(mode).positions(self.prior, mode.component, mode.mean[None], times)
+            for p, mode in zip(self.probabilities, self.modes, strict=True)
+        ]
+        mean: np.ndarray = np.sum(parts, axis=0)[0] + self.origin
+        return mean
+
+    def sample(
+        self,
+        rng: np.random.Generator,
+        n: int,
+        times: np.ndarray,
+        joined: np.ndarray | None = None,
+        earlier: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Return posterior draws at times, (n, T, J, 3).
+
+        ``earlier``, (n, O, J, 3), are draws at the times ``joined``, (O,), that the draws
+        continue: they are observed to within a centimetre.
+        """
+        units = rng.standard_normal((n, max(len(mode.mean) for mode in self.modes)))
+        units *= _INFLATION
+        chances = rng.random(n)
+        slack = _JOIN_NOISE * rng.standard_normal((n, 0 if earlier is None else earlier[0].size))
+        log_weights = np.repeat(np.log(self.probabilities)[None], n, axis=0)
+        corrections = []
+        if joined is not None and earlier is not None:
+            target = (earlier - self.origin).reshape(n, -1)
+            for index, mode in enumerate(self.modes):
+                gaussian = self._gaussian(mode)
+                design = gaussian.design(self.prior, joined)
+                half = _INFLATION * solve_triangular(mode.lower, design.T, lower=True)
+                covariance = half.T @ half + _JOIN_NOISE**2 * np.eye(half.shape[1])
+                factor = np.linalg.cholesky(covariance)
+                centre = gaussian.positions(self.prior, mode.component, mode.mean[None], joined)
+                off = solve_triangular(factor, (target - centre.reshape(1, -1)).T, lower=True)
+                log_weights[:, index] -= 0.5 * (off**2).sum(axis=0) + np.log(np.diag(factor)).sum()
+                corrections.append((half, factor, target))
+        weights = np.exp(log_weights - log_weights.max(axis=1, keepdims=True))
+        cumulative = np.cumsum(weights, axis=1)
+        chosen = (cumulative < chances[:, None] * cumulative[:, -1:]).sum(axis=1)
+        out = np.empty((n, len(times), len(self.prior.children) + 1, 3))
+        for index in np.unique(chosen).tolist():
+            mode, rows = self.modes[index], np.flatnonzero(chosen == index)
+            gaussian, q = self._gaussian(mode), len(mode.mean)
+            unit = units[rows, :q].T
+            z = mode.mean + solve_triangular(mode.lower, unit, lower=True, trans=1).T
+            if corrections and joined is not None:
+                half, factor, target = corrections[index]
+                at = gaussian.positions(self.prior, mode.component, z, joined)
+                gap = target[rows] + slack[rows] - at.reshape(len(rows), -1)
+                inner = solve_triangular(factor, gap.T, lower=True)
+                inner = solve_triangular(factor, inner, lower=True, trans=1)
+                change = solve_triangular(mode.lower, half @ inner, lower=True, trans=1).T
+                z = z + _INFLATION * change
+            out[rows] = gaussian.positions(self.prior, mode.component, z, times) + self.origin
+        return out
+
+    def _gaussian(self, mode: WindowMode) -> _Gaussian:
+        return _Gaussian(self.prior, mode.component, mode.yaw, mode.scale)
+
+
+def lift_window(
+    prior: WindowPrior,
+    camera: LevelCamera,
+    seen: Observed,
+    depth: np.ndarray,
+    *,
+    candidates: int = 3,
+    tilt: float = 0.0,
+) -> WindowPosterior:
+    """Return the posterior of a window.
+
+    Parameters
+    ----------
+    prior : WindowPrior
+    camera : LevelCamera
+    seen : Observed
+    depth : ndarray, (L,)
+        First estimate of the body's distance, metres.
+    candidates : int
+        Number of components and headings that are refined.
+    tilt : float
+        Standard deviation of the camera's pitch about the given one, radians; 0 if it is known.
+    """
+    middle, filled = _without_gaps(seen)
+    factor, chosen = _screened(prior, camera, middle, filled, depth, candidates)
+    path = camera.points(middle, factor * depth)
+    origin = path.mean(axis=0)
+    origin[1] -= 1.0  # the body's middle is about a metre above the floor
+    modes = [_refined(prior, camera, seen, path, origin, k, yaw, tilt) for k, yaw in chosen]
+    best = max(mode.score for mode in modes)
+    kept = [mode for mode in modes if _TEMPER * (mode.score - best) > np.log(_SMALL)]
+    return WindowPosterior(prior, origin, tuple(kept))
+
+
+def _without_gaps(seen: Observed) -> tuple[np.ndarray, np.ndarray]:
+    """Return each frame's median keypoint, (L, 2), and keypoints without gaps, (L, J, 2)."""
+    visible = seen.weight > 0
+    times = np.arange(len(visible))
+    points = np.where(visible[..., None], seen.points, np.nan)
+    full = visible.any(axis=1)
+    middle = np.empty((len(times), 2))
+    median = np.nanmedian(points[full], axis=1)
+    for i in range(2):
+        middle[:, i] = np.interp(times, times[full], median[:, i])
+    filled = np.repeat(middle[:, None], visible.shape[1], axis=1)
+    for j in range(visible.shape[1]):
+        rows = np.flatnonzero(visible[:, j])
+        for i in range(2):
+            if len(rows):
+                offset = np.interp(times, rows, points[rows, j, i] - middle[rows, i])
+                filled[:, j, i] += median_filter(offset, 5, mode="nearest")
+    return middle, filled
+
+
+def _screened(
+    prior: WindowPrior,
+    camera: LevelCamera,
+    middle: np.ndarray,
+    filled: np.ndarray,
+    depth: np.ndarray,
+    candidates: int,
+) -> tuple[float, list[tuple[int, int]]]:
+    """Return the best factor of the depth, and probable components with their headings."""
+    A = len(prior.yaws)
+    turn = round(np.arctan(middle[:, 0].mean()) / (2 * np.pi / A))  # heading relative to the ray
+    best, factor, scores = -np.inf, 1.0, np.zeros((0, 0))
+    for tried in (0.85, 1.0, 1.18):
+        metres = filled * (tried * depth)[:, None, None]
+        origin = camera.points(middle, tried * depth).mean(axis=0)
+        origin[1] -= 1.0
+        # Closer bodies are smaller: the density of pixels needs the Jacobian of metres.
+        values = prior.screen(metres - camera.axes[:2] @ origin, camera.pitch)
+        values = values + 24 * len(prior.limbs) * np.log(tried)
+        if values.max() > best:
+            best, factor, scores = values.max(), tried, values
+    chosen: list[tuple[int, int]] = []
+    for index in np.argsort(-scores, axis=None).tolist():
+        k, yaw = divmod(index, A)
+        if len(chosen) == candidates or scores[k, yaw] < best - _SCREENED:
+            break
+        yaw = (yaw - turn) % A
+        gaps = [(yaw - other) % A for part, other in chosen if part == k]
+        if all(_NEAR < gap < A - _NEAR for gap in gaps):
+            chosen.append((k, yaw))
+    return factor, chosen
+
+
+def _refined(
+    prior: WindowPrior,
+    camera: LevelCamera,
+    seen: Observed,
+    path: np.ndarray,
+    origin: np.ndarray,
+    k: int,
+    yaw: int,
+    tilt: float,
+) -> WindowMode:
+    """Return the mode of one component and heading."""
+    mean = prior.component(k).mean @ rotation(prior.yaws[yaw]).T
+    pose = mean - mean.mean(axis=1, keepdims=True) + path[:, None]
+    at = np.repeat(path[:, None], mean.shape[1], axis=1)  # weak perspective at first
+    outliers, force = np.full(seen.weight.shape, _WIDE**-2), np.zeros(at.shape)
+    scales = [1.0]
+    visible = seen.weight > 0
+    mode, leverage = None, None
+    for number in range(_ROUNDS):
+        matrix, target = camera.linearised(at, seen.points)
+        target = target - matrix @ origin
+        # Positions relative to a camera of greater pitch are turned about its right.
+        turn = tilt * (matrix[..., 1] * at[..., 2:] - matrix[..., 2] * at[..., 1:2])
+        weight = seen.weight * outliers * (camera.focal / (seen.noise * camera.depth(at))) ** 2
+        best = None
+        for scale in prior.scales.tolist() if number == 1 else scales:
+            tried, share = _solved(prior, k, yaw, scale, matrix, target, weight, pose, force, turn)
+            positions = tried.positions + origin
+            turned = replace(camera, pitch=camera.pitch + tilt * tried.pitch)
+            square = seen.weight * _squares(turned, seen, positions)
+            fit = -0.5 * (FREEDOM + 2) * np.log1p(square[visible] / FREEDOM).sum()
+            score = tried.score + fit + prior.log_weights[k]
+            if best is None or score > best.score:
+                best = replace(
+                    tried,
+                    score=score,
+                    positions=positions,
+                    standardised=square,
+                    pitch=turned.pitch,
+                )
+                leverage = share
+        mode = best
+        assert mode is not None
+        assert leverage is not None
+        scales, at, pose = [mode.scale], mode.positions, mode.positions
+        camera = replace(camera, pitch=mode.pitch)
+        outliers = (FREEDOM + 2) / (FREEDOM + mode.standardised)
+        force = (leverage / camera.depth(at))[..., None] * camera.axes[2]
+    assert mode is not None
+    return mode
+
+
+def _squares(camera: LevelCamera, seen: Observed, positions: np.ndarray) -> np.ndarray:
+    """Return squared residuals in units of the noise, (L, J)."""
+    residual = (seen.points - camera.project(positions)) * camera.focal / seen.noise
+    square: np.ndarray = (residual**2).sum(axis=-1)
+    return square
+
+
+def _solved(
+    prior: WindowPrior,
+    k: int,
+    yaw: int,
+    scale: float,
+    matrix: np.ndarray,
+    target: np.ndarray,
+    weight: np.ndarray,
+    pose: np.ndarray,
+    force: np.ndarray,
+    turn: np.ndarray,
+) -> tuple[WindowMode, np.ndarray]:
+    """Return the Gaussian posterior of A X = t with given weights, and leverages, (L, J)."""
+    gaussian = _Gaussian(prior, k, yaw, scale)
+    part, R, sd = gaussian.part, gaussian.rotation, gaussian.deviation
+    L, J = weight.shape
+    r, bones = len(sd), J - 1
+    q, n = r + 2 + bones, 2 * L * J
+    root = np.sqrt(weight)[..., None]
+    turned = (matrix * root[..., None]) @ R
+    design, residual = np.zeros((n + L * bones, q)), np.empty(n + L * bones)
+    design[:n, :r] = ((turned @ part.basis) * sd).reshape(n, r)
+    design[:n, r] = (matrix[..., 1] * root).ravel() * _HEIGHT
+    design[:n, r + 1] = (turn * root).ravel()
+    residual[:n] = (target * root - (turned @ part.mean[..., None])[..., 0]).ravel()
+    # Bones, linearised along their current directions.
+    along = pose[:, prior.children] - pose[:, prior.parents]
+    along = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), _BONE_NOISE) @ R
+    spread = part.basis[:, prior.children] - part.basis[:, prior.parents]
+    rows = (along[..., None, :] @ spread)[..., 0, :] * sd
+    design[n:, :r] = rows.reshape(L * bones, r) / _BONE_NOISE
+    own = np.arange(L * bones)
+    design[n + own, r + 2 + own % bones] = -np.tile(part.bones, L) * _PROPORTIONS / _BONE_NOISE
+    average = part.mean[:, prior.children] - part.mean[:, prior.parents]
+    residual[n:] = (part.bones - (along * average).sum(axis=-1)).ravel() / _BONE_NOISE
+    precision = design.T @ design
+    precision[np.arange(q), np.arange(q)] += 1.0
+    pull = design.T @ residual
+    pull[:r] += np.tensordot(force @ R, part.basis, axes=3) * sd
+    pull[r] += force[..., 1].sum() * _HEIGHT
+    lower = np.linalg.cholesky(precision)
+    z = solve_triangular(lower, solve_triangular(lower, pull, lower=True), lower=True, trans=1)
+    half = solve_triangular(lower, design[:n].T, lower=True)
+    leverage = np.einsum("qn,qn->n", half, half).reshape(L, J, 2).sum(axis=-1)
+    stretch = residual[n:] - design[n:] @ z
+    score = -0.5 * (z @ z + stretch @ stretch) - np.log(np.diag(lower)).sum()
+    positions = gaussian.positions(prior, k, z[None], np.arange(L))[0]
+    blank = np.empty((0, 0))
+    return WindowMode(float(score), k, yaw, scale, z, lower, positions, blank, z[r + 1]), leverage

@@ -1,0 +1,94 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from probmotion.data.synthetic.gaits import make_gait
+from probmotion.data.videos import film, quadruped_as_person
+from probmotion.lifting import lift
+
+SEEN = slice(2, None)  # person14 but for pelvis and neck
+
+
+def about_hips(positions: np.ndarray) -> np.ndarray:
+    return (positions - positions[..., [8, 11], :].mean(axis=-2, keepdims=True))[..., SEEN, :]
+
+
+def test_a_walk_is_lifted(video, lifted):
+    truth = video.motion.positions
+    error = np.linalg.norm(about_hips(lifted.mean.positions) - about_hips(truth), axis=-1)
+    assert error.mean() < 0.1
+    # The motion's axes have the camera at (0, height, 0).
+    path = lifted.mean.positions[:, 0] - [0, lifted.camera_height, 0]
+    distance = np.linalg.norm(truth[:, 0], axis=-1).mean()
+    assert np.linalg.norm(path - truth[:, 0], axis=-1).mean() < 0.15 * distance
+    assert lifted.noise == pytest.approx(4.0, abs=1.0)
+    low, high = np.quantile(about_hips(lifted.draws), [0.05, 0.95], axis=0)
+    inside = (about_hips(truth) >= low) & (about_hips(truth) <= high)
+    assert inside.mean() > 0.6
+    assert lifted.trusted
+
+
+def test_the_cameras_project_the_mean_to_the_keypoints(lifted):
+    pixels = lifted.cameras.project(lifted.mean.positions)[0]
+    residual = np.linalg.norm(pixels - lifted.keypoints, axis=-1)[lifted.weight > 0]
+    assert np.median(residual) < 2 * lifted.noise
+
+
+def test_draws_depend_on_the_seed_alone(video, lifted):
+    again = lift(video.track, image_size=video.size, progress=False, draws=40)
+    assert np.array_equal(again.draws, lifted.draws)
+    other = lift(video.track, image_size=video.size, progress=False, draws=40, seed=1)
+    assert np.array_equal(other.mean.positions, lifted.mean.positions)
+    assert not np.array_equal(other.draws, lifted.draws)
+
+
+def test_taller_people_are_farther_away(video, lifted):
+    tall = lift(video.track, image_size=video.size, progress=False, draws=2, height=2.04)
+    assert np.allclose(tall.mean.positions, 1.2 * lifted.mean.positions)
+
+
+@pytest.mark.parametrize("kind", ["random", "mirrored", "animal"])
+def test_keypoints_that_no_person_explains_are_flagged(video, kind):
+    track = video.track
+    if kind == "animal":
+        gait = quadruped_as_person(make_gait("quadruped-trot", 1, frames=60))
+        track = film(gait, 0, azimuth=1.0, height=0.8).track
+    points = track.keypoints.copy()
+    if kind == "random":
+        points = np.where(
+            np.isfinite(points), np.random.default_rng(0).uniform(200, 800, points.shape), np.nan
+        )
+    if kind == "mirrored":
+        points[..., 0] = 1000 - points[..., 0]
+    result = lift(
+        replace(track, keypoints=points), image_size=(1000, 1000), progress=False, draws=2
+    )
+    assert not result.trusted
+    assert result.summary()[0].startswith("Do not trust")
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "words"),
+    [
+        ({"keypoints": slice(0, 1)}, {}, "at least"),
+        ({}, {"fov": 500.0}, "fov must be 10 to 150"),
+        ({}, {"height": 170.0}, "height must be .5 to 2.5"),
+        ({}, {"image_size": (100, 100)}, "pixels of an image of 100"),
+        ({}, {"image_size": (0, 100)}, "image_size"),
+        ({}, {"noise": -1.0}, "noise"),
+        ({}, {"draws": 1}, "draws"),
+        ({"absent": True}, {}, "at least half of the frames"),
+    ],
+)
+def test_bad_input_is_refused(video, change, options, words):
+    track = video.track
+    if "keypoints" in change:
+        rows = change["keypoints"]
+        track = replace(track, keypoints=track.keypoints[rows], confidence=track.confidence[rows])
+    if "absent" in change:
+        confidence = track.confidence.copy()
+        confidence[:60] = 0.0
+        track = replace(track, confidence=confidence)
+    with pytest.raises(ValueError, match=words):
+        lift(track, **{"image_size": video.size, "progress": False} | options)
