@@ -22,6 +22,7 @@ HIPS = [PERSON.joint_names.index(f"{side}_hip") for side in ("left", "right")]
 WALKS = ("cmu_02_02", "humanoid3d_long_walk3")
 FRAMES, VIEWS = 150, 4  # of each clip
 HEIGHTS = (1.0, 2.2)  # of the cameras, metres
+GOOD = 100.0  # largest mean error of lifts that should not be flagged, mm
 MADE = 15  # videos of each kind that must be flagged
 
 
@@ -37,7 +38,8 @@ def lift_figures(folder: Path) -> Iterator[tuple[str, float]]:
             result = lifted(video)
             kind = "walk" if clip.name.startswith(WALKS) else "other"
             rows[kind].append(errors(result, video))
-            flagged.append(not result.trusted)
+            if rows[kind][-1][0] <= GOOD:
+                flagged.append(not result.trusted)
     walk, every = (np.array(rows["walk"]), np.array(rows["walk"] + rows["other"]))
     yield "lift_walk_mpjpe_mm", float(np.median(walk[:, 0]))
     yield "lift_all_mpjpe_mm", float(np.median(every[:, 0]))

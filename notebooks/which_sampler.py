@@ -27,7 +27,7 @@ WHEN = {
     "nuts": "log density with a gradient; start many chains and check R-hat",
     "mh": "log density without a gradient; start many chains and check R-hat",
     "ancestral3d": "3D denoiser",
-    "split-gibbs": "linear Gaussian observations and a 2D or 3D denoiser",
+    "split-gibbs": "observations and a 2D or 3D denoiser",
     "mvpc": "2D denoiser without observations",
     "mas": "comparison with the published method; `mvpc` costs the same",
     "dvae": "priors with an inference network; otherwise it trains one first",

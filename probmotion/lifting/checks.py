@@ -66,7 +66,7 @@ _LIMITS = {
         "keypoints of a joint do not follow a body before a still camera (does the camera move?)",
     ),
     "surprise": (1.5, "the motion is unlike those from which the prior was learnt"),
-    "proportions": (1.8, "the body has unusual proportions (another animal, swapped joints?)"),
+    "proportions": (3.0, "the body has unusual proportions (another animal, swapped joints?)"),
     "mirrored": (
         80.0,
         "the motion is more likely with left and right exchanged (is the video mirrored?)",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from probmotion.motion.motion import KeypointTrack
 from probmotion.motion.retargeting import counterpart
@@ -21,6 +22,7 @@ _GROUPS = (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"))
 _SWAP_COST = 0.05  # of a frame with exchanged sides, in units of a frame's typical motion
 _CAPPED = 5.0  # largest cost of one joint in a step, in the same units
 _LIMBS = {"elbow": 0.28, "wrist": 0.21, "knee": 0.42, "ankle": 0.41}  # bone lengths, metres
+_FILTERED = 5  # frames
 _SPREAD = 0.1  # of the logarithm of a frame's size
 
 
@@ -137,8 +139,9 @@ def body_depth(points: np.ndarray, weight: np.ndarray) -> np.ndarray:
         parent = PERSON.parents[joint]
         size = np.linalg.norm(points[:, joint] - points[:, parent], axis=-1) / length
         known = (weight[:, joint] > 0) & (weight[:, parent] > 0)
-        ratios = np.column_stack([ratios, np.where(known, size, 0.0)])
-    # The second largest is safe from one outlier.
+        # Outliers last for single frames.
+        size = median_filter(np.where(known, size, 0.0), _FILTERED, mode="nearest")
+        ratios = np.column_stack([ratios, size])
     size = np.sort(ratios, axis=1)[:, -2]
     rows = np.flatnonzero(size > 0)
     times = np.arange(len(points)) - (len(points) - 1) / 2

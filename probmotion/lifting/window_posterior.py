@@ -34,6 +34,7 @@ _HEIGHT = 0.3  # standard deviation of the floor's height relative to the camera
 _JOIN_NOISE = 0.01  # standard deviation with which draws continue earlier ones, metres
 _ROUNDS = 4  # of the linearisation
 _SCREENED = 40.0  # nats below the best component at which others are left out
+_FACTORS = (0.72, 0.85, 1.0, 1.18, 1.39)  # of the first estimate of the distance
 _NEAR = 2  # headings of one component that are this close are one candidate
 _WIDE = 3.0  # factor of the noise in the first round
 _SMALL = 1e-4  # probability of modes that are left out
@@ -269,7 +270,7 @@ def _screened(
     A = len(prior.yaws)
     turn = round(np.arctan(middle[:, 0].mean()) / (2 * np.pi / A))  # heading relative to the ray
     best, factor, scores = -np.inf, 1.0, np.zeros((0, 0))
-    for tried in (0.85, 1.0, 1.18):
+    for tried in _FACTORS:
         metres = filled * (tried * depth)[:, None, None]
         origin = camera.points(middle, tried * depth).mean(axis=0)
         origin[1] -= 1.0

@@ -37,7 +37,7 @@ from typing import Any
 import numpy as np
 
 from probmotion.io.errors import MotionFileError, read_bytes, shortened
-from probmotion.io.keypoints.mediapipe import MEDIAPIPE, read_landmarks
+from probmotion.io.keypoints.mediapipe import read_landmarks
 from probmotion.io.keypoints.mmpose import read_mmpose
 from probmotion.io.keypoints.tracks import (
     Detection,
@@ -88,11 +88,6 @@ def read_json(
             read_landmarks(content, path, image_size)
             or read_mmpose(content, path)
             or _parsed(content, path)
-        )
-    if image_size is not None and parsed.format != MEDIAPIPE:
-        raise MotionFileError(
-            f"{path}: image_size must be None for {parsed.format}, whose keypoints are in pixels, "
-            f"got {image_size}"
         )
     return keypoint_file(parsed, path, fps, skeleton, people)
 

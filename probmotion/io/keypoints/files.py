@@ -78,7 +78,7 @@ def open_keypoints(
         :func:`~probmotion.io.keypoints.tracks.link_people`.
     image_size : (float, float), optional
         Width and height of the image in pixels; required for normalised landmarks of MediaPipe,
-        unless the file contains it.
+        unless the file contains it, and without effect on keypoints in pixels.
 
     Returns
     -------
@@ -108,7 +108,6 @@ def open_keypoints(
     for name, given, unused in (
         ("people", people, archive or table),
         ("skeleton", skeleton, archive),
-        ("image_size", image_size, archive or suffix in _HDF5),
     ):
         if given is not None and unused:
             raise ValueError(f"{name} must be None for {path.suffix} files, got {given!r}")

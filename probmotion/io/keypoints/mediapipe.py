@@ -55,7 +55,7 @@ def read_landmarks(
     Raises
     ------
     MotionFileError
-        If the file is damaged, or ``image_size`` is missing or not applicable.
+        If the file is damaged, or ``image_size`` is missing.
     """
     header: dict[str, Any] = content if isinstance(content, dict) else {}
     lists = ("frames", "landmarks")
@@ -153,10 +153,6 @@ def _landmark_frames(
                 "None; pass image_size=(width, height) in pixels (--image-size WIDTH HEIGHT)"
             )
         frames = [[(each * [*size, 1.0], person) for each, person in people] for people in frames]
-    elif points and image_size is not None:
-        raise MotionFileError(
-            f"{path}: image_size must be None for landmarks in pixels, got {image_size}"
-        )
     skeleton = Skeleton.preset("mediapipe33")
     return numbered_frames(MEDIAPIPE, entries, frames, skeleton, header, path)
 

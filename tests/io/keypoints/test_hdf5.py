@@ -187,5 +187,3 @@ def test_unreadable_files_and_positions_in_3d(tmp_path):
         deep.to_netcdf(tmp_path / "deep.nc", engine="h5netcdf")
     with pytest.raises(MotionFileError, match="expected positions x and y, got 3 axes"):
         read_keypoints(tmp_path / "deep.nc", 30)
-    with pytest.raises(ValueError, match=r"image_size must be None for .h5 files, got \(1, 1\)"):
-        read_keypoints(path, 30, image_size=(1, 1))

@@ -153,8 +153,8 @@ def test_pixels_and_landmarks_without_visibility(tmp_path):
     (track,) = read_keypoints(path, 30)
     assert track.keypoints[0, 5].tolist() == [105, 200]
     assert (track.confidence == 1).all()
-    with pytest.raises(MotionFileError, match="image_size must be None for landmarks in pixels"):
-        read_keypoints(path, 30, image_size=SIZE)
+    (same,) = read_keypoints(path, 30, image_size=SIZE)
+    assert np.array_equal(same.keypoints, track.keypoints)
 
 
 @pytest.mark.parametrize(
