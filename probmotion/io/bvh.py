@@ -51,7 +51,8 @@ def read_bvh(path: str | Path, scale: float | None = None, end_sites: bool = Fal
     motion : Motion
         Motion in metres, joints in the file's order. A frame time rounded from an integer rate is
         read as that rate. Rotations are dropped if a joint other than a root translates relative to
-        its parent.
+        its parent, and if the file has joints that
+        :func:`~probmotion.motion.inverse_kinematics.rigid_motion` added, which are left out.
 
     Raises
     ------
@@ -76,6 +77,13 @@ def read_bvh(path: str | Path, scale: float | None = None, end_sites: bool = Fal
     rest_offsets = translations[0].copy()
     for root in skeleton.roots:
         rest_offsets[root] = joints[root].offset
+    kept = [
+        joint
+        for joint in range(skeleton.n_joints)
+        if not _is_part_of_parent(joint, skeleton, translations)
+    ]
+    if len(kept) < skeleton.n_joints:
+        positions, skeleton, rigid = positions[:, kept], skeleton.subset(kept), False
     return Motion(
         positions * scale,
         skeleton,
@@ -84,6 +92,14 @@ def read_bvh(path: str | Path, scale: float | None = None, end_sites: bool = Fal
         rest_offsets=rest_offsets * scale if rigid else None,
         name=path.stem,
     )
+
+
+def _is_part_of_parent(joint: int, skeleton: Skeleton, translations: np.ndarray) -> bool:
+    """Return whether a joint was added by ``rigid_motion``, in its parent's place."""
+    parent = skeleton.parents[joint]
+    if parent < 0 or translations[:, joint].any():
+        return False
+    return skeleton.joint_names[joint].startswith(f"{skeleton.joint_names[parent]}_to_")
 
 
 def _skeleton(every: list[BVHJoint], joints: list[BVHJoint]) -> Skeleton:

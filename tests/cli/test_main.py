@@ -302,8 +302,9 @@ def test_show_and_convert_draws(tmp_path, capsys, fails):
     assert "4 x 3 (chains x draws)" in capsys.readouterr().out
     target = tmp_path / "draw.bvh"
     assert main(["convert", str(path), str(target), "--draw", "2"]) == 0
-    expected = rigid_motion(MotionDraws.load(path).motion(2))
-    back = load(target).retarget(expected.skeleton)
+    draw = MotionDraws.load(path).motion(2)
+    expected = rigid_motion(draw).retarget(draw.skeleton)
+    back = load(target).retarget(draw.skeleton)
     np.testing.assert_allclose(back.positions, expected.positions, atol=1e-4)
     assert fails("convert", path, target, "--draw", "3") == "draw must be 0 to 2, got 3"
     assert fails("convert", target, target, "--draw", "0").startswith("draw requires a file of dr")
