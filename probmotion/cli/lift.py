@@ -54,11 +54,10 @@ class Lift:
     """Seed of the draws."""
 
     strict: FlagCreatePairsOff[bool] = False
-    """Fail (exit status 1) if a motion cannot be trusted."""
+    """Fail (exit status 2) if a motion does not pass all checks."""
 
     def run(self) -> None:
         from probmotion.files import writable_folder
-        from probmotion.io.errors import errors_in
         from probmotion.io.keypoints.files import read_keypoints
         from probmotion.lifting.track_lift import lift
 
@@ -69,10 +68,10 @@ class Lift:
                 raise ValueError(f"person must be 0 to {len(tracks) - 1}, got {self.person}")
             tracks = [tracks[self.person]]
         writable_folder(self.out)
-        doubtful = []
+        doubtful, refused = [], []
         for number, track in enumerate(tracks):
             folder = self.out if len(tracks) == 1 else self.out / f"person-{number}"
-            with errors_in(self.keypoints):
+            try:
                 result = lift(
                     track,
                     image_size=self.image_size,
@@ -81,13 +80,21 @@ class Lift:
                     draws=self.draws,
                     seed=self.seed,
                 )
+            except ValueError as error:
+                if len(tracks) == 1:
+                    raise
+                refused.append(error)
+                print(f"person {number} was not lifted: {error}")
+                continue
             result.save(folder)
             print("\n".join(result.summary()))
             print(f"wrote {folder / 'lift.html'}, lift.bvh, lift.glb, lift.npz, summary.json")
             if not result.trusted:
-                doubtful.append(track.name or str(number))
+                doubtful.append(str(folder))
+        if len(refused) == len(tracks):
+            raise refused[0]
         if self.strict and doubtful:
             raise ValueError(
-                f"motions must pass all checks with --strict, got doubtful ones: "
+                f"motions must pass all checks with --strict, got failures in "
                 f"{', '.join(doubtful)}; see lift.html"
             )

@@ -58,9 +58,10 @@ class Evidence(NamedTuple):
     mirrored: float
 
 
+_FEWEST, _SHARE = 10, 0.1  # visible frames of the joints whose residuals are checked
 # Limits were chosen on made videos of training and validation clips.
 _LIMITS = {
-    "noise": (0.04, "the keypoints' noise is more than 4 % of a metre at the person's distance"),
+    "noise": (0.04, "the keypoints' noise is more than 4 cm at the person's distance"),
     "residual": (
         1.35,
         "keypoints of a joint do not follow a body before a still camera (does the camera move?)",
@@ -78,7 +79,7 @@ def checked(evidence: Evidence) -> tuple[Check, ...]:
     """Return all checks.
 
     ``noise``: that of keypoints, in metres at the person's distance. ``residual``: largest ratio of
-    a joint's robust residuals to those of the others. ``surprise`` and ``proportions``: mean
+    a joint's robust residuals to the noise. ``surprise`` and ``proportions``: mean
     squares of standardised coefficients of the motion and of bone lengths. ``mirrored``: log
     evidence per window of exchanged sides.
     """
@@ -88,7 +89,7 @@ def checked(evidence: Evidence) -> tuple[Check, ...]:
     joints = [
         float(np.sqrt(np.median(values[values > 0] ** 2) / MEDIAN))
         for values in standardised.T
-        if (values > 0).any()
+        if (values > 0).sum() >= max(_FEWEST, _SHARE * len(values))
     ]
     depth = evidence.camera.depth(evidence.mean).mean()
     bones = PERSON.n_joints - 1

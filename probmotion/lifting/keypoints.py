@@ -11,7 +11,9 @@ from probmotion.motion.motion import KeypointTrack
 from probmotion.motion.retargeting import counterpart
 from probmotion.motion.skeleton import Skeleton
 
-__all__ = ["PersonKeypoints", "averaged", "body_depth", "person_keypoints"]
+__all__ = [
+    "BodyPath", "PersonKeypoints", "averaged", "body_path", "person_keypoints", "smooth_size",
+]  # fmt: skip
 
 PERSON = Skeleton.preset("person14")
 # Neck and pelvis of detectors are midpoints of shoulders and hips, which motion capture has not.
@@ -19,9 +21,9 @@ _TRUNK = ("neck", "pelvis")
 LIMBS = [j for j, name in enumerate(PERSON.joint_names) if name not in _TRUNK]
 """Joints of arms and legs."""
 _GROUPS = (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"))
-_SWAP_COST = 0.05  # of a frame with exchanged sides, in units of a frame's typical motion
-_CAPPED = 5.0  # largest cost of one joint in a step, in the same units
-_LIMBS = {"elbow": 0.28, "wrist": 0.21, "knee": 0.42, "ankle": 0.41}  # bone lengths, metres
+_SWAP_COST = 1.5  # of a second with exchanged sides, in units of a frame's typical motion
+_CAPPED = 5.0  # largest cost of a step, in the same units
+_LENGTHS = {"elbow": 0.28, "wrist": 0.21, "knee": 0.42, "ankle": 0.41}  # bone lengths, metres
 _FILTERED = 5  # frames
 _SPREAD = 0.1  # of the logarithm of a frame's size
 
@@ -30,7 +32,8 @@ class PersonKeypoints(NamedTuple):
     """Keypoints of ``person14``.
 
     ``points``, (L, 14, 2), pixels, 0 where missing; ``weight``, (L, 14), multiplier of the
-    precision; ``swapped``, share of limbs whose sides were exchanged.
+    precision, 1 for the median confidence; ``swapped``, share of arms and legs whose sides were
+    exchanged.
     """
 
     points: np.ndarray
@@ -63,11 +66,13 @@ def person_keypoints(track: KeypointTrack) -> PersonKeypoints:
         if origin is not None:
             seen = track.confidence[:, origin] > 0
             points[seen, joint] = track.keypoints[seen, origin]
-            weight[:, joint] = np.minimum(track.confidence[:, origin], 1.0)
-    return _unswapped(points, weight)
+            weight[:, joint] = track.confidence[:, origin]
+    if weight.any():
+        weight /= np.median(weight[weight > 0])
+    return _unswapped(points, weight, _SWAP_COST / track.fps)
 
 
-def _unswapped(points: np.ndarray, weight: np.ndarray) -> PersonKeypoints:
+def _unswapped(points: np.ndarray, weight: np.ndarray, cost: float) -> PersonKeypoints:
     """Return keypoints whose left and right limbs do not jump to the other side.
 
     For arms and legs, the cheapest sequence of ordinary and exchanged frames (Viterbi) has the
@@ -87,9 +92,9 @@ def _unswapped(points: np.ndarray, weight: np.ndarray) -> PersonKeypoints:
                 step = np.linalg.norm(points[1:, after] - points[:-1, before], axis=-1)
                 known = (weight[1:, after] > 0) & (weight[:-1, before] > 0)
                 costs[i, j] = np.where(known, step, 0.0).sum(axis=1)
-        typical = np.median(costs[0, 0]) if len(points) > 1 else 0.0
-        costs = np.minimum(costs / max(typical, 1e-9), _CAPPED)
-        exchanged = _cheapest(costs)
+        moving = costs[0, 0][costs[0, 0] > 0]
+        typical = np.median(moving) if len(moving) else 1.0
+        exchanged = _cheapest(np.minimum(costs / typical, _CAPPED), cost)
         for frame in np.flatnonzero(exchanged):
             points[frame, left + right] = points[frame, right + left]
             weight[frame, left + right] = weight[frame, right + left]
@@ -97,15 +102,15 @@ def _unswapped(points: np.ndarray, weight: np.ndarray) -> PersonKeypoints:
     return PersonKeypoints(points, weight, float(np.mean(swapped)))
 
 
-def _cheapest(costs: np.ndarray) -> np.ndarray:
+def _cheapest(costs: np.ndarray, cost: float) -> np.ndarray:
     """Return which frames are exchanged, (L,), for costs (2, 2, L − 1) of steps."""
     frames = costs.shape[2] + 1
-    total = np.array([0.0, _SWAP_COST])
+    total = np.array([0.0, cost])
     origins = np.zeros((frames, 2), dtype=int)
     for frame in range(1, frames):
         ways = total[:, None] + costs[:, :, frame - 1]
         origins[frame] = ways.argmin(axis=0)
-        total = ways.min(axis=0) + np.array([0.0, _SWAP_COST])
+        total = ways.min(axis=0) + np.array([0.0, cost])
     state = int(total.argmin())
     out = np.zeros(frames, dtype=bool)
     for frame in range(frames - 1, -1, -1):
@@ -125,15 +130,26 @@ def averaged(keypoints: PersonKeypoints, step: int) -> PersonKeypoints:
     return PersonKeypoints(mean, total, keypoints.swapped)
 
 
-def body_depth(points: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return the distance of a body from the camera over its focal length, (L,).
+class BodyPath(NamedTuple):
+    """Middle of the body in the image, (L, 2), pixels, and its size, (L,), pixels per metre.
 
-    In every frame some bone is nearly parallel to the image. The logarithm of the largest ratio of
-    a bone's size in the image to its length is fitted by a straight line over time, robustly.
+    Frames without a visible body are interpolated.
     """
+
+    middle: np.ndarray
+    size: np.ndarray
+
+
+def body_path(keypoints: PersonKeypoints) -> BodyPath:
+    """Return the path of a body in the image.
+
+    In every frame some bone is nearly parallel to the image: the size is the second largest ratio
+    of a bone's size in the image to its length, which is safe from one outlier.
+    """
+    points, weight, _ = keypoints
     ratios = np.zeros((len(points), 0))
     for joint, name in enumerate(PERSON.joint_names):
-        length = _LIMBS.get(name.rpartition("_")[2])
+        length = _LENGTHS.get(name.rpartition("_")[2])
         if length is None:
             continue
         parent = PERSON.parents[joint]
@@ -142,15 +158,29 @@ def body_depth(points: np.ndarray, weight: np.ndarray) -> np.ndarray:
         # Outliers last for single frames.
         size = median_filter(np.where(known, size, 0.0), _FILTERED, mode="nearest")
         ratios = np.column_stack([ratios, size])
-    size = np.sort(ratios, axis=1)[:, -2]
-    rows = np.flatnonzero(size > 0)
-    times = np.arange(len(points)) - (len(points) - 1) / 2
-    if len(rows) < 2:
-        raise ValueError("keypoints must have visible limbs in two frames, got fewer")
-    logs, robust = np.log(size[rows]), np.ones(len(rows))
+    sizes = np.sort(ratios, axis=1)[:, -2]
+    frames = np.arange(len(points))
+    seen = np.flatnonzero(sizes > 0)
+    if len(seen) < 2:
+        raise ValueError(
+            f"track must show two bones of the arms or legs in several frames, got {len(seen)} of "
+            f"{len(points)} (averaged) frames"
+        )
+    size = np.exp(np.interp(frames, seen, np.log(sizes[seen])))
+    visible = np.flatnonzero((weight > 0).any(axis=1))
+    shown = np.where(weight[..., None] > 0, points, np.nan)[visible]
+    median = np.nanmedian(shown, axis=1)
+    middle = [np.interp(frames, visible, median[:, i]) for i in range(2)]
+    return BodyPath(np.stack(middle, axis=-1), size)
+
+
+def smooth_size(size: np.ndarray) -> np.ndarray:
+    """Return sizes whose logarithms are a straight line over time, fitted robustly, (L,)."""
+    times = np.arange(len(size)) - (len(size) - 1) / 2
+    logs, robust = np.log(size), np.ones(len(size))
     slope, level = 0.0, float(np.median(logs))
     for _ in range(10):
-        slope, level = np.polyfit(times[rows], logs, 1, w=np.sqrt(robust))
-        robust = 1 / (1 + ((logs - slope * times[rows] - level) / _SPREAD) ** 2)
-    depth: np.ndarray = np.exp(-(slope * times + level))
-    return depth
+        slope, level = np.polyfit(times, logs, 1, w=np.sqrt(robust))
+        robust = 1 / (1 + ((logs - slope * times - level) / _SPREAD) ** 2)
+    line: np.ndarray = np.exp(slope * times + level)
+    return line

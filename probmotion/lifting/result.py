@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from probmotion.io.npz import write_npz
 from probmotion.lifting.camera import LevelCamera
 from probmotion.lifting.checks import Check
 from probmotion.lifting.page import lift_page
+from probmotion.motion.inverse_kinematics import rigid_motion
 from probmotion.motion.motion import Motion
 
 __all__ = ["Lift"]
@@ -43,6 +45,8 @@ class Lift:
         Keypoints that were used, pixels; 0 where missing.
     weight : ndarray, (L, J)
         Multiplier of their precision; 0 where missing.
+    swapped : float
+        Share of arms and legs whose sides were exchanged before lifting.
     checks : tuple of Check
         Predictive checks.
     """
@@ -54,9 +58,10 @@ class Lift:
     noise: float
     keypoints: np.ndarray
     weight: np.ndarray
+    swapped: float
     checks: tuple[Check, ...]
 
-    @property
+    @cached_property
     def sd(self) -> np.ndarray:
         """Posterior standard deviation of positions relative to the root, (L, J, 3), metres."""
         deviation: np.ndarray = (self.draws - self.draws[:, :, :1]).std(axis=0, ddof=1)
@@ -79,7 +84,7 @@ class Lift:
     def summary(self) -> list[str]:
         """Return three sentences: whether to trust the motion, how precise it is, the camera."""
         failed = [check.problem for check in self.checks if not check.passed]
-        trust = "The keypoints are explained by a person who moves like the prior."
+        trust = "A person who moves like those of the prior explains the keypoints."
         if failed:
             trust = f"Do not trust this motion: {'; '.join(failed)}."
         spread = 1000 * np.sqrt((self.sd[:, 1:] ** 2).sum(axis=-1))
@@ -116,8 +121,9 @@ class Lift:
         folder = Path(folder)
         writable_folder(folder)
         self.report(folder / "lift.html")
-        save(self.mean, folder / "lift.bvh")
-        save(self.mean, folder / "lift.glb")
+        rigid = rigid_motion(self.mean)
+        save(rigid, folder / "lift.bvh")
+        save(rigid, folder / "lift.glb")
         write_npz(self.mean, folder / "lift.npz", {"sd": self.sd, "draws": self.draws})
         content = {
             "trusted": self.trusted,
@@ -133,6 +139,7 @@ class Lift:
                 "height": self.camera_height,
             },
             "noise_pixels": self.noise,
+            "swapped_share": self.swapped,
         }
         with written_whole(folder / "summary.json") as unfinished:
             unfinished.write_text(json.dumps(content, indent=1), encoding="utf-8")

@@ -13,12 +13,13 @@ from probmotion import seeds
 from probmotion.lifting.camera import LevelCamera
 from probmotion.lifting.checks import MEDIAN, Evidence, checked
 from probmotion.lifting.keypoints import (
-    LIMBS,
     PERSON,
+    BodyPath,
     PersonKeypoints,
     averaged,
-    body_depth,
+    body_path,
     person_keypoints,
+    smooth_size,
 )
 from probmotion.lifting.result import Lift
 from probmotion.lifting.window_posterior import Observed, WindowPosterior, lift_window
@@ -33,6 +34,7 @@ __all__ = ["lift"]
 
 _SECONDS = 2.0  # length of a window
 _RATE = 15.0  # approximate rate at which keypoints are averaged, per second
+_SLOWEST = 5.0  # frame rate
 _FEWEST = 8  # frames of a window at this rate
 _FOV = 60.0  # default horizontal field of view, degrees
 _HEIGHT, _HEIGHT_SPREAD = 1.7, 0.06  # of adults: mean, metres, and relative standard deviation
@@ -48,6 +50,7 @@ class _Windows(NamedTuple):
     """Averaged keypoints and the windows into which they are cut."""
 
     keypoints: PersonKeypoints
+    path: BodyPath
     prior: WindowPrior
     starts: list[int]
     step: int
@@ -65,9 +68,12 @@ class _Windows(NamedTuple):
         rows = slice(start, start + self.prior.frames)
         points, weight = self.keypoints.points[rows], self.keypoints.weight[rows]
         seen = np.where(weight[..., None] > 0, camera.normalised(points), 0.0)
-        depth = camera.focal * body_depth(points, weight)
+        depth = camera.focal / smooth_size(self.path.size[rows])
+        middle = camera.normalised(self.path.middle[rows])
         observed = Observed(seen, weight, noise)
-        return lift_window(self.prior, camera, observed, depth, candidates=candidates, tilt=tilt)
+        return lift_window(
+            self.prior, camera, observed, middle, depth, candidates=candidates, tilt=tilt
+        )
 
 
 def lift(
@@ -99,7 +105,7 @@ def lift(
         Horizontal field of view, degrees. Distances from the camera are proportional to the focal
         length, which one still view hardly determines.
     height : float, optional
-        The person's height, metres; by default 1.7 ± .1, which every draw has as its scale.
+        The person's height, metres; by default 1.7 ± .1: each draw has its own.
     noise : float, optional
         Scale of the noise of a keypoint of confidence 1, pixels; estimated by default.
     draws : int
@@ -115,8 +121,12 @@ def lift(
         If the track is too short, has too few keypoints, or arguments are out of range.
     """
     check_count("draws", draws, least=2)
-    width, depth = image_size
+    check_count("seed", seed, least=0)
     check_positive("image_size", min(image_size))
+    if track.fps < _SLOWEST:
+        raise ValueError(
+            f"track must have at least {_SLOWEST:g} frames per second, got {track.fps:g}; check fps"
+        )
     if not 10 <= fov <= 150:
         raise ValueError(f"fov must be 10 to 150 degrees, got {fov:g}")
     if height is not None and not 0.5 <= height <= 2.5:
@@ -127,14 +137,15 @@ def lift(
     _check_visible(keypoints.weight, track)
     _check_inside(keypoints, image_size)
     windows = _windows(keypoints, track.fps)
-    focal = 0.5 * width / np.tan(np.radians(fov) / 2)
-    camera = LevelCamera(focal, (width / 2, depth / 2))
+    focal = 0.5 * image_size[0] / np.tan(np.radians(fov) / 2)
+    camera = LevelCamera(focal, (image_size[0] / 2, image_size[1] / 2))
     steps = len(windows.starts)
     with one_thread(), progress_bar(steps, "lift", progress) as bar:
         guess = noise or _NOISE * max(image_size)
         camera, estimate, mirrored = _estimated(windows, camera, guess)
         noise = noise or estimate
-        with ThreadPoolExecutor(2) as pool:
+        pool = ThreadPoolExecutor(2)
+        try:
             futures = [
                 pool.submit(windows.posterior, start, camera, noise) for start in windows.starts
             ]
@@ -142,12 +153,16 @@ def lift(
             for future in futures:
                 posteriors.append(future.result())
                 bar.update()
+        finally:
+            pool.shutdown(cancel_futures=True)
         mean, chains = _stitched(windows, posteriors, track.frames, draws, seed)
     floor = float(np.median([_floor(posterior) for posterior in posteriors]))
     scale = (height or _HEIGHT) / _HEIGHT
     spread = _HEIGHT_SPREAD if height is None else _MEASURED
-    sizes = 1 + spread * seeds.generator(seed, "lift: size").standard_normal((draws, 1, 1, 1))
-    chains = scale * sizes * (chains - [0.0, floor, 0.0])
+    # Size and distance are proportional: the camera stays where it is.
+    chains *= 1 + spread * seeds.generator(seed, "lift: size").standard_normal((draws, 1, 1, 1))
+    chains -= [0.0, floor, 0.0]
+    chains *= scale
     motion = Motion(scale * (mean - [0.0, floor, 0.0]), PERSON, track.fps, name=track.name)
     evidence = Evidence(keypoints, camera, noise, mean, posteriors, mirrored)
     return Lift(
@@ -158,6 +173,7 @@ def lift(
         noise,
         keypoints.points,
         keypoints.weight,
+        keypoints.swapped,
         checked(evidence),
     )
 
@@ -176,7 +192,8 @@ def _check_inside(keypoints: PersonKeypoints, image_size: tuple[int, int]) -> No
     """Refuse keypoints that are not pixels of the image."""
     seen = keypoints.points[keypoints.weight > 0]
     low, high = np.quantile(seen, 0.05, axis=0), np.quantile(seen, 0.95, axis=0)
-    if (high > np.multiply(1.1, image_size)).any() or (high - low).max() < 5:
+    size = np.array(image_size)
+    if (high > 1.1 * size).any() or (low < -0.1 * size).any() or (high - low).max() < 5:
         raise ValueError(
             f"keypoints must be pixels of an image of {image_size[0]} × {image_size[1]}, got "
             f"{low[0]:.3g} to {high[0]:.3g} in x and {low[1]:.3g} to {high[1]:.3g} in y; give "
@@ -187,7 +204,7 @@ def _check_inside(keypoints: PersonKeypoints, image_size: tuple[int, int]) -> No
 @lru_cache(maxsize=2)
 def _prior(frames: int, fps: float) -> WindowPrior:
     """Return the shipped prior for windows; cached per process."""
-    return WindowPrior(SpectralMixtureMotion.load("cmu-motion"), frames, fps, LIMBS)
+    return WindowPrior(SpectralMixtureMotion.load("cmu-motion"), frames, fps)
 
 
 def _windows(keypoints: PersonKeypoints, fps: float) -> _Windows:
@@ -203,7 +220,7 @@ def _windows(keypoints: PersonKeypoints, fps: float) -> _Windows:
     length = min(frames, round(_SECONDS * fps / step))
     count = max(1, -(-2 * (frames - length) // length) + 1)
     starts = np.linspace(0, frames - length, count).round().astype(int).tolist()
-    return _Windows(coarse, _prior(length, fps / step), starts, step)
+    return _Windows(coarse, body_path(coarse), _prior(length, fps / step), starts, step)
 
 
 def _estimated(

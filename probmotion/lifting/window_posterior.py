@@ -208,6 +208,7 @@ def lift_window(
     prior: WindowPrior,
     camera: LevelCamera,
     seen: Observed,
+    middle: np.ndarray,
     depth: np.ndarray,
     *,
     candidates: int = 3,
@@ -220,6 +221,8 @@ def lift_window(
     prior : WindowPrior
     camera : LevelCamera
     seen : Observed
+    middle : ndarray, (L, 2)
+        Middle of the body, normalised image coordinates.
     depth : ndarray, (L,)
         First estimate of the body's distance, metres.
     candidates : int
@@ -227,56 +230,56 @@ def lift_window(
     tilt : float
         Standard deviation of the camera's pitch about the given one, radians; 0 if it is known.
     """
-    middle, filled = _without_gaps(seen)
-    factor, chosen = _screened(prior, camera, middle, filled, depth, candidates)
+    factor, chosen = _screened(prior, camera, seen, middle, depth, candidates)
     path = camera.points(middle, factor * depth)
-    origin = path.mean(axis=0)
-    origin[1] -= 1.0  # the body's middle is about a metre above the floor
+    origin = _below(path)
     modes = [_refined(prior, camera, seen, path, origin, k, yaw, tilt) for k, yaw in chosen]
     best = max(mode.score for mode in modes)
     kept = [mode for mode in modes if _TEMPER * (mode.score - best) > np.log(_SMALL)]
     return WindowPosterior(prior, origin, tuple(kept))
 
 
-def _without_gaps(seen: Observed) -> tuple[np.ndarray, np.ndarray]:
-    """Return each frame's median keypoint, (L, 2), and keypoints without gaps, (L, J, 2)."""
+def _below(path: np.ndarray) -> np.ndarray:
+    """Return the point a metre below the mean of a body's middle: about the floor, (3,)."""
+    below: np.ndarray = path.mean(axis=0) - [0.0, 1.0, 0.0]
+    return below
+
+
+def _without_gaps(seen: Observed, middle: np.ndarray) -> tuple[np.ndarray, list[int]]:
+    """Return the keypoints of the window's visible joints without gaps, (L, n, 2), and joints."""
     visible = seen.weight > 0
+    joints = np.flatnonzero(visible.any(axis=0)).tolist()
     times = np.arange(len(visible))
-    points = np.where(visible[..., None], seen.points, np.nan)
-    full = visible.any(axis=1)
-    middle = np.empty((len(times), 2))
-    median = np.nanmedian(points[full], axis=1)
-    for i in range(2):
-        middle[:, i] = np.interp(times, times[full], median[:, i])
-    filled = np.repeat(middle[:, None], visible.shape[1], axis=1)
-    for j in range(visible.shape[1]):
-        rows = np.flatnonzero(visible[:, j])
+    filled = np.repeat(middle[:, None], len(joints), axis=1)
+    for column, joint in enumerate(joints):
+        rows = np.flatnonzero(visible[:, joint])
         for i in range(2):
-            if len(rows):
-                offset = np.interp(times, rows, points[rows, j, i] - middle[rows, i])
-                filled[:, j, i] += median_filter(offset, 5, mode="nearest")
-    return middle, filled
+            offset = np.interp(times, rows, seen.points[rows, joint, i] - middle[rows, i])
+            filled[:, column, i] += median_filter(offset, 5, mode="nearest")
+    return filled, joints
 
 
 def _screened(
     prior: WindowPrior,
     camera: LevelCamera,
+    seen: Observed,
     middle: np.ndarray,
-    filled: np.ndarray,
     depth: np.ndarray,
     candidates: int,
 ) -> tuple[float, list[tuple[int, int]]]:
     """Return the best factor of the depth, and probable components with their headings."""
     A = len(prior.yaws)
+    filled, joints = _without_gaps(seen, middle)
+    if not joints:  # nobody is visible: draws continue those of the window before
+        return 1.0, [(k, 0) for k in np.argsort(-prior.log_weights)[:candidates].tolist()]
     turn = round(np.arctan(middle[:, 0].mean()) / (2 * np.pi / A))  # heading relative to the ray
     best, factor, scores = -np.inf, 1.0, np.zeros((0, 0))
     for tried in _FACTORS:
         metres = filled * (tried * depth)[:, None, None]
-        origin = camera.points(middle, tried * depth).mean(axis=0)
-        origin[1] -= 1.0
+        origin = _below(camera.points(middle, tried * depth))
         # Closer bodies are smaller: the density of pixels needs the Jacobian of metres.
-        values = prior.screen(metres - camera.axes[:2] @ origin, camera.pitch)
-        values = values + 24 * len(prior.limbs) * np.log(tried)
+        values = prior.screen(metres - camera.axes[:2] @ origin, joints, camera.pitch)
+        values = values + 2 * prior.low * len(joints) * np.log(tried)
         if values.max() > best:
             best, factor, scores = values.max(), tried, values
     chosen: list[tuple[int, int]] = []
@@ -308,18 +311,20 @@ def _refined(
     outliers, force = np.full(seen.weight.shape, _WIDE**-2), np.zeros(at.shape)
     scales = [1.0]
     visible = seen.weight > 0
+    given, pitch = camera.pitch, 0.0  # pitch: deviation from the given one over its spread
     mode, leverage = None, None
     for number in range(_ROUNDS):
         matrix, target = camera.linearised(at, seen.points)
         target = target - matrix @ origin
         # Positions relative to a camera of greater pitch are turned about its right.
         turn = tilt * (matrix[..., 1] * at[..., 2:] - matrix[..., 2] * at[..., 1:2])
+        target = target + pitch * turn
         weight = seen.weight * outliers * (camera.focal / (seen.noise * camera.depth(at))) ** 2
         best = None
         for scale in prior.scales.tolist() if number == 1 else scales:
             tried, share = _solved(prior, k, yaw, scale, matrix, target, weight, pose, force, turn)
             positions = tried.positions + origin
-            turned = replace(camera, pitch=camera.pitch + tilt * tried.pitch)
+            turned = replace(camera, pitch=given + tilt * tried.pitch)
             square = seen.weight * _squares(turned, seen, positions)
             fit = -0.5 * (FREEDOM + 2) * np.log1p(square[visible] / FREEDOM).sum()
             score = tried.score + fit + prior.log_weights[k]
@@ -337,6 +342,7 @@ def _refined(
         assert leverage is not None
         scales, at, pose = [mode.scale], mode.positions, mode.positions
         camera = replace(camera, pitch=mode.pitch)
+        pitch = (mode.pitch - given) / tilt if tilt else 0.0
         outliers = (FREEDOM + 2) / (FREEDOM + mode.standardised)
         force = (leverage / camera.depth(at))[..., None] * camera.axes[2]
     assert mode is not None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -14,6 +13,7 @@ from probmotion.models.mixture.spectral_mixture import SpectralMixtureMotion
 __all__ = ["ReducedComponent", "WindowPrior"]
 
 _SMALLEST = 0.02  # prior standard deviation of the coefficients that are kept, metres
+_SCREENS = 6  # cameras and sets of joints whose screening is kept
 _LOW = 12  # frequencies by which components are screened
 _SCREEN_NOISE = 0.03  # of the screened keypoints with the neglected perspective, metres
 _PITCH_STEP = np.radians(20.0)  # between the cameras of the screening
@@ -52,7 +52,7 @@ class ReducedComponent(NamedTuple):
 class WindowPrior:
     """Components of a spectral prior for windows of L frames at a lower frame rate.
 
-    Coefficients whose prior standard deviation is below 15 mm are set to 0: keypoints hardly
+    Coefficients whose prior standard deviation is below 2 cm are set to 0: keypoints hardly
     determine them.
 
     Parameters
@@ -62,15 +62,12 @@ class WindowPrior:
         L.
     fps : float
         Frame rate of the windows.
-    limbs : sequence of int
-        Joints that detectors see, by which components are screened.
     """
 
-    def __init__(
-        self, prior: SpectralMixtureMotion, frames: int, fps: float, limbs: Sequence[int]
-    ) -> None:
+    def __init__(self, prior: SpectralMixtureMotion, frames: int, fps: float) -> None:
         self.prior = prior.resampled(frames, fps)
-        self.frames, self.fps, self.limbs = frames, fps, list(limbs)
+        self.frames, self.fps = frames, fps
+        self.low = min(_LOW, frames)
         self.log_weights = np.log(prior.weights)
         self.yaws = prior.yaws
         self.scales = prior.scales
@@ -78,7 +75,7 @@ class WindowPrior:
         self.children = np.flatnonzero(parents >= 0)
         self.parents = parents[self.children]
         self._reduced: dict[int, ReducedComponent] = {}
-        self._screens: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+        self._screens: dict[tuple[int, ...], tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
 
     def cosines(self, times: np.ndarray) -> np.ndarray:
         """Return the orthonormal cosines at times in frames of the window, (T, L)."""
@@ -131,42 +128,46 @@ class WindowPrior:
         times = np.arange(self.frames)
         return [self.mean_at(k, times) for k in range(len(self.log_weights))]
 
-    def screen(self, points: np.ndarray, pitch: float) -> np.ndarray:
+    def screen(self, points: np.ndarray, joints: list[int], pitch: float) -> np.ndarray:
         """Return approximate log p(points, component, heading), (K, A), up to a constant.
 
         Parameters
         ----------
-        points : ndarray, (L, J, 2)
+        points : ndarray, (L, n, 2)
             Keypoints as orthographic projections in metres, right and up, without gaps, relative
             to the projection of the prior's origin.
+        joints : list of int
+            Their joints.
         pitch : float
             Pitch of the camera, radians.
         """
         step = round(pitch / _PITCH_STEP)
-        if step not in self._screens:
-            self._screens[step] = self._views(step * _PITCH_STEP)
-        precision, mean, offset = self._screens[step]
-        low = precision.shape[2]
-        points = points[:, self.limbs]
+        key = (step, *joints)
+        if key not in self._screens:
+            while len(self._screens) >= _SCREENS:
+                self._screens.pop(next(iter(self._screens)))
+            self._screens[key] = self._views(step * _PITCH_STEP, joints)
+        precision, mean, offset = self._screens[key]
+        low = self.low
         coefficients = np.tensordot(self._cosines[:, :low], points, axes=(0, 0)).reshape(low, -1)
         deviation = (coefficients - mean).astype(np.float32)
         square = ((precision @ deviation[..., None])[..., 0] * deviation).sum(axis=(2, 3))
         return offset - 0.5 * square
 
-    def _views(self, pitch: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _views(self, pitch: float, joints: list[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return precisions (K, A, F, 2J, 2J), means and log weights of orthographic views."""
-        prior, low = self.prior, min(_LOW, self.frames)
-        K, A, J = len(self.log_weights), len(self.yaws), len(self.limbs)
+        prior, low = self.prior, self.low
+        K, A, J = len(self.log_weights), len(self.yaws), len(joints)
         camera = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(pitch), np.sin(pitch)]])
         precision = np.empty((K, A, low, 2 * J, 2 * J), np.float32)
         mean = np.empty((K, A, low, 2 * J), np.float32)
         offset = np.empty((K, A))
         for k in range(K):
             V = prior.directions[k][prior.band[:low]]
-            V = V.reshape(low, -1, 3, V.shape[-1])[:, self.limbs]
+            V = V.reshape(low, -1, 3, V.shape[-1])[:, joints]
             variances = prior.variances[k][:low].copy()
             variances[0, :2] = prior.skeleton.n_joints * self.frames * prior.ground**2
-            means = self._means[k][:, self.limbs]
+            means = self._means[k][:, joints]
             motion = np.tensordot(self._cosines[:, :low], means, axes=(0, 0))
             for a, yaw in enumerate(self.yaws):
                 view = camera @ rotation(yaw)

@@ -40,6 +40,17 @@ def test_every_person_has_a_folder(capsys, detections, tmp_path):
     assert text.count("The camera is") == 2
 
 
+def test_people_who_are_hardly_visible_are_named(capsys, detections, tmp_path):
+    results = json.loads(detections.read_text(encoding="utf-8"))
+    few = [each for each in results if each["idx"] == 0 or int(each["image_id"][:-4]) % 5 == 0]
+    path = tmp_path / "few.json"
+    path.write_text(json.dumps(few), encoding="utf-8")
+    out = tmp_path / "out"
+    assert main(["lift", str(path), "--fps", "30", *SIZE, "--draws", "2", "--out", str(out)]) == 0
+    assert "person 1 was not lifted: track must show the person" in capsys.readouterr().out
+    assert [folder.name for folder in out.iterdir()] == ["person-0"]
+
+
 def test_errors_are_one_line_and_leave_no_files(fails, detections, tmp_path):
     out = tmp_path / "out"
     base = ["lift", str(detections), "--out", str(out)]

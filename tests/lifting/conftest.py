@@ -7,7 +7,6 @@ import pytest
 from probmotion.data.synthetic.gaits import make_gait
 from probmotion.data.videos import Video, film
 from probmotion.lifting import Lift, lift
-from probmotion.lifting.keypoints import LIMBS
 from probmotion.lifting.window_prior import WindowPrior
 from probmotion.models.mixture.spectral_mixture import SpectralMixtureMotion
 
@@ -27,4 +26,4 @@ def lifted(video: Video) -> Lift:
 @pytest.fixture(scope="session")
 def window_prior() -> WindowPrior:
     """Return the prior of windows of 20 frames at 10 frames per second."""
-    return WindowPrior(SpectralMixtureMotion.load("cmu-motion"), 20, 10.0, LIMBS)
+    return WindowPrior(SpectralMixtureMotion.load("cmu-motion"), 20, 10.0)

@@ -7,8 +7,9 @@ from probmotion.lifting.keypoints import (
     PERSON,
     PersonKeypoints,
     averaged,
-    body_depth,
+    body_path,
     person_keypoints,
+    smooth_size,
 )
 from probmotion.motion.motion import KeypointTrack
 from probmotion.motion.skeleton import Skeleton
@@ -66,10 +67,26 @@ def test_averages_have_the_weights_of_frames():
     assert mean.weight[:, 0].tolist() == [4.0, 0.0]
 
 
-def test_depth_is_that_of_the_size_in_the_image(pixels):
-    # 200 pixels per metre: depth over focal length is 1/200; receding doubles it.
+def test_size_is_that_of_the_image(pixels):
     weight = np.ones(pixels.shape[:2])
-    assert body_depth(pixels, weight) == pytest.approx(1 / 200, rel=0.1)
-    growth = np.geomspace(1, 2, 60)
-    receding = body_depth((pixels - 500) / growth[:, None, None], weight)
-    assert receding[-1] / receding[0] == pytest.approx(2, rel=0.1)
+    path = body_path(PersonKeypoints(pixels, weight, 0.0))
+    assert smooth_size(path.size) == pytest.approx(200, rel=0.1)
+    assert np.abs(path.middle - pixels.mean(axis=1)).max() < 60
+    # A body that recedes to twice the distance has half the size.
+    growth = np.geomspace(1, 2, 60)[:, None, None]
+    receding = body_path(PersonKeypoints((pixels - 500) / growth, weight, 0.0))
+    line = smooth_size(receding.size)
+    assert line[0] / line[-1] == pytest.approx(2, rel=0.1)
+
+
+def test_frames_without_a_body_are_interpolated(pixels):
+    weight = np.ones(pixels.shape[:2])
+    weight[20:45] = 0
+    path = body_path(PersonKeypoints(np.where(weight[..., None] > 0, pixels, 0), weight, 0.0))
+    assert path.size == pytest.approx(200, rel=0.25)
+    assert np.isfinite(path.middle).all()
+
+
+def test_low_confidences_are_relative(pixels):
+    track = KeypointTrack(pixels, np.full(pixels.shape[:2], 0.01), PERSON, 30.0)
+    assert np.allclose(person_keypoints(track).weight, 1)

@@ -35,6 +35,17 @@ def test_the_cameras_project_the_mean_to_the_keypoints(lifted):
     assert np.median(residual) < 2 * lifted.noise
 
 
+def test_people_may_be_absent_for_two_windows(video):
+    long = film(make_gait("walk", 3, frames=240), 0, azimuth=0.8)
+    confidence = long.track.confidence.copy()
+    confidence[90:180] = 0
+    track = replace(long.track, confidence=confidence)
+    result = lift(track, image_size=long.size, progress=False, draws=8)
+    assert np.isfinite(result.draws).all()
+    spread = np.linalg.norm(about_hips(result.draws).std(axis=0), axis=-1).mean(axis=1)
+    assert spread[120:150].mean() > 1.5 * spread[30:60].mean()
+
+
 def test_draws_depend_on_the_seed_alone(video, lifted):
     again = lift(video.track, image_size=video.size, progress=False, draws=40)
     assert np.array_equal(again.draws, lifted.draws)
@@ -78,6 +89,8 @@ def test_keypoints_that_no_person_explains_are_flagged(video, kind):
         ({}, {"image_size": (0, 100)}, "image_size"),
         ({}, {"noise": -1.0}, "noise"),
         ({}, {"draws": 1}, "draws"),
+        ({"fps": 1.0}, {}, "at least 5 frames per second"),
+        ({"shift": -700.0}, {}, "pixels of an image"),
         ({"absent": True}, {}, "at least half of the frames"),
     ],
 )
@@ -86,6 +99,10 @@ def test_bad_input_is_refused(video, change, options, words):
     if "keypoints" in change:
         rows = change["keypoints"]
         track = replace(track, keypoints=track.keypoints[rows], confidence=track.confidence[rows])
+    if "fps" in change:
+        track = replace(track, fps=change["fps"])
+    if "shift" in change:
+        track = replace(track, keypoints=track.keypoints + change["shift"])
     if "absent" in change:
         confidence = track.confidence.copy()
         confidence[:60] = 0.0

@@ -20,9 +20,14 @@ def observed(window_prior, noise: float = 4.0):
     return truth, Observed(CAMERA.project(truth), np.ones(truth.shape[:2]), noise)
 
 
+def lift(window_prior, camera, seen, depth, **options):
+    middle = np.median(seen.points, axis=1)
+    return lift_window(window_prior, camera, seen, middle, depth, **options)
+
+
 def test_a_likely_motion_is_found(window_prior):
     truth, seen = observed(window_prior)
-    posterior = lift_window(window_prior, CAMERA, seen, np.full(20, 4.3))
+    posterior = lift(window_prior, CAMERA, seen, np.full(20, 4.3))
     mean = posterior.mean(np.arange(20.0))
     error = (mean - mean[:, 8:9]) - (truth - truth[:, 8:9])  # about a hip
     assert np.linalg.norm(error, axis=-1).mean() < 0.08
@@ -39,8 +44,8 @@ def test_outliers_do_not_move_the_motion(window_prior):
     points[4, 4] += 0.3
     points[11, 10] -= 0.2
     times, depth = np.arange(20.0), np.full(20, 4.3)
-    clean = lift_window(window_prior, CAMERA, seen, depth).mean(times)
-    broken = lift_window(window_prior, CAMERA, Observed(points, seen.weight, 4.0), depth)
+    clean = lift(window_prior, CAMERA, seen, depth).mean(times)
+    broken = lift(window_prior, CAMERA, Observed(points, seen.weight, 4.0), depth)
     # At 4 m these outliers are 1.2 and .8 m.
     assert np.abs(broken.mean(times) - clean).max() < 0.3
     assert np.median(np.abs(broken.mean(times) - clean)) < 0.03
@@ -49,25 +54,25 @@ def test_outliers_do_not_move_the_motion(window_prior):
 def test_the_pitch_of_the_camera_is_inferred(window_prior):
     _, seen = observed(window_prior)
     wrong = LevelCamera(900.0, (500.0, 500.0), 0.0)
-    posterior = lift_window(window_prior, wrong, seen, np.full(20, 4.3), tilt=0.15)
+    posterior = lift(window_prior, wrong, seen, np.full(20, 4.3), tilt=0.15)
     assert posterior.best.pitch == pytest.approx(CAMERA.pitch, abs=0.04)
 
 
 def test_draws_have_the_moments_of_the_modes(window_prior):
     _, seen = observed(window_prior, noise=4.0)
-    posterior = lift_window(window_prior, CAMERA, seen, np.full(20, 4.0), candidates=1)
+    posterior = lift(window_prior, CAMERA, seen, np.full(20, 4.0), candidates=1)
     times = np.arange(20.0)
     draws = posterior.sample(np.random.default_rng(0), 4000, times)
     spread = draws.std(axis=0)
     assert np.abs(draws.mean(axis=0) - posterior.mean(times)).max() < 5 * spread.max() / 63
     # More noise, more spread.
-    wide = lift_window(window_prior, CAMERA, observed(window_prior, 40.0)[1], np.full(20, 4.0))
+    wide = lift(window_prior, CAMERA, observed(window_prior, 40.0)[1], np.full(20, 4.0))
     assert wide.sample(np.random.default_rng(0), 400, times).std(axis=0).mean() > spread.mean()
 
 
 def test_draws_continue_earlier_ones(window_prior):
     _, seen = observed(window_prior, noise=4.0)
-    posterior = lift_window(window_prior, CAMERA, seen, np.full(20, 4.0))
+    posterior = lift(window_prior, CAMERA, seen, np.full(20, 4.0))
     times, joined = np.arange(20.0), np.array([3.0, 4.0])
     rng = np.random.default_rng(0)
     earlier = posterior.sample(rng, 50, joined)

@@ -32,7 +32,8 @@ def test_screening_prefers_the_component_and_heading_of_a_motion(window_prior):
     mean = window_prior.component(k).mean
     c, s = np.cos(window_prior.yaws[yaw]), np.sin(window_prior.yaws[yaw])
     world = mean @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]).T
-    scores = window_prior.screen(world[..., :2], 0.0)
+    limbs = list(range(2, 14))
+    scores = window_prior.screen(world[:, limbs, :2], limbs, 0.0)
     assert abs(int(scores[k].argmax()) - yaw) <= 2
     assert scores[k, yaw] > scores[k, (yaw + 12) % 24] + 10
     assert scores[k, yaw] > np.median(scores.max(axis=1))
