@@ -56,25 +56,45 @@ def write_bvh(motion: Motion, path: str | Path) -> None:
     offsets[list(skeleton.roots)] = 0.0
     angles = np.unwrap(np.rad2deg(matrix_to_euler(motion.rotations, _ORDER)), period=360.0, axis=0)
     columns = []
-    for joint in skeleton.topological_order:
+    order = _file_order(skeleton)
+    for joint in order:
         if skeleton.parents[joint] < 0:
             columns.append(motion.positions[:, joint])
         columns.append(angles[:, joint])
     values = np.round(np.concatenate(columns, axis=-1), _DECIMALS) + 0.0  # avoids -0.00000000
     row = " ".join([f"%.{_DECIMALS}f"] * values.shape[1])
-    lines = ["HIERARCHY", *_hierarchy(skeleton, np.round(offsets, _DECIMALS)), "MOTION"]
+    lines = ["HIERARCHY", *_hierarchy(skeleton, order, np.round(offsets, _DECIMALS)), "MOTION"]
     lines += [f"Frames: {motion.frames}", f"Frame Time: {1 / motion.fps!r}"]
     lines += [row % tuple(frame) for frame in values.tolist()]
     with written_whole(Path(path)) as unfinished:
         unfinished.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
 
 
-def _hierarchy(skeleton: Skeleton, offsets: np.ndarray) -> list[str]:
+def _file_order(skeleton: Skeleton) -> list[int]:
+    """Return the joints depth first, children by the smallest index below them.
+
+    Joints that ``rigid_motion`` adds come last in a skeleton, but do not change the others' order.
+    """
+    smallest = list(range(skeleton.n_joints))
+    for joint in reversed(skeleton.topological_order):
+        parent = skeleton.parents[joint]
+        if parent >= 0:
+            smallest[parent] = min(smallest[parent], smallest[joint])
+    order: list[int] = []
+    waiting = sorted(skeleton.roots, key=smallest.__getitem__, reverse=True)
+    while waiting:
+        order.append(waiting.pop())
+        children = [joint for joint, parent in skeleton.bones if parent == order[-1]]
+        waiting += sorted(children, key=smallest.__getitem__, reverse=True)
+    return order
+
+
+def _hierarchy(skeleton: Skeleton, order: list[int], offsets: np.ndarray) -> list[str]:
     """Return the lines of the hierarchy."""
     depths: dict[int, int] = {}
     lines: list[str] = []
     open_blocks = 0
-    for joint in skeleton.topological_order:
+    for joint in order:
         parent = skeleton.parents[joint]
         depth = depths[joint] = depths[parent] + 1 if parent >= 0 else 0
         lines += ["\t" * level + "}" for level in reversed(range(depth, open_blocks))]
