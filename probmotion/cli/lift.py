@@ -44,6 +44,10 @@ class Lift:
     fov: float = 60.0
     """Horizontal field of view, degrees. Distances from the camera depend on it."""
 
+    pitch: Annotated[float | None, arg(metavar="DEGREES", help_behavior_hint="")] = None
+    """Angle of the camera above the horizon, degrees, negative if it looks down; estimated by
+    default, with errors of about 10° in motion unlike that of the prior."""
+
     height: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
     """Height of the person, metres; 1.7 ± .1 by default."""
 
@@ -76,6 +80,7 @@ class Lift:
                     track,
                     image_size=self.image_size,
                     fov=self.fov,
+                    pitch=self.pitch,
                     height=self.height,
                     draws=self.draws,
                     seed=self.seed,

@@ -81,6 +81,7 @@ def lift(
     *,
     image_size: tuple[int, int],
     fov: float = _FOV,
+    pitch: float | None = None,
     height: float | None = None,
     noise: float | None = None,
     draws: int = 100,
@@ -104,6 +105,9 @@ def lift(
     fov : float
         Horizontal field of view, degrees. Distances from the camera are proportional to the focal
         length, which one still view hardly determines.
+    pitch : float, optional
+        Angle of the camera above the horizon, degrees, negative if it looks down; estimated by
+        default.
     height : float, optional
         The person's height, metres; by default 1.7 ± .1: each draw has its own.
     noise : float, optional
@@ -129,6 +133,8 @@ def lift(
         )
     if not 10 <= fov <= 150:
         raise ValueError(f"fov must be 10 to 150 degrees, got {fov:g}")
+    if pitch is not None and not -80 <= pitch <= 80:
+        raise ValueError(f"pitch must be -80 to 80 degrees, got {pitch:g}")
     if height is not None and not 0.5 <= height <= 2.5:
         raise ValueError(f"height must be .5 to 2.5 metres, got {height:g}; is it in metres?")
     if noise is not None:
@@ -142,7 +148,9 @@ def lift(
     steps = len(windows.starts)
     with one_thread(), progress_bar(steps, "lift", progress) as bar:
         guess = noise or _NOISE * max(image_size)
-        camera, estimate, mirrored = _estimated(windows, camera, guess)
+        camera, estimate, mirrored = _estimated(
+            windows, camera, guess, None if pitch is None else np.radians(pitch)
+        )
         noise = noise or estimate
         pool = ThreadPoolExecutor(2)
         try:
@@ -224,7 +232,7 @@ def _windows(keypoints: PersonKeypoints, fps: float) -> _Windows:
 
 
 def _estimated(
-    windows: _Windows, camera: LevelCamera, noise: float
+    windows: _Windows, camera: LevelCamera, noise: float, pitch: float | None
 ) -> tuple[LevelCamera, float, float]:
     """Return the camera with its pitch, the noise, and the evidence for mirrored keypoints."""
     weight, length = windows.keypoints.weight, windows.prior.frames
@@ -246,10 +254,11 @@ def _estimated(
     def score(posteriors: list[WindowPosterior]) -> float:
         return sum(posterior.best.score for posterior in posteriors)
 
-    first = max((found(pitch, _TILT) for pitch in _PITCHES), key=score)
-    pitch = float(np.median([posterior.best.pitch for posterior in first]))
-    second = found(pitch, _TILT, candidates=3)
-    pitch = float(np.median([posterior.best.pitch for posterior in second]))
+    if pitch is None:
+        first = max((found(start, _TILT) for start in _PITCHES), key=score)
+        pitch = float(np.median([posterior.best.pitch for posterior in first]))
+        second = found(pitch, _TILT, candidates=3)
+        pitch = float(np.median([posterior.best.pitch for posterior in second]))
     camera = replace(camera, pitch=pitch)
     parts = found(pitch, 0.0)
     squares = np.concatenate([part.best.standardised[part.best.standardised > 0] for part in parts])

@@ -54,6 +54,15 @@ def test_draws_depend_on_the_seed_alone(video, lifted):
     assert not np.array_equal(other.draws, lifted.draws)
 
 
+def test_a_given_pitch_is_kept(video, lifted):
+    # The made camera is at 1.4 m and looks at a point 1 m above the floor.
+    distance = np.linalg.norm(video.motion.positions[:, 0, [0, 2]], axis=-1).mean()
+    true = -np.degrees(np.arctan2(0.4, distance))
+    assert np.degrees(lifted.camera.pitch) == pytest.approx(true, abs=8)
+    given = lift(video.track, image_size=video.size, progress=False, draws=2, pitch=true)
+    assert given.camera.pitch == pytest.approx(np.radians(true))
+
+
 def test_taller_people_are_farther_away(video, lifted):
     tall = lift(video.track, image_size=video.size, progress=False, draws=2, height=2.04)
     assert np.allclose(tall.mean.positions, 1.2 * lifted.mean.positions)
@@ -89,6 +98,7 @@ def test_keypoints_that_no_person_explains_are_flagged(video, kind):
         ({}, {"image_size": (0, 100)}, "image_size"),
         ({}, {"noise": -1.0}, "noise"),
         ({}, {"draws": 1}, "draws"),
+        ({}, {"pitch": 100.0}, "pitch must be -80 to 80"),
         ({"fps": 1.0}, {}, "at least 5 frames per second"),
         ({"shift": -700.0}, {}, "pixels of an image"),
         ({"absent": True}, {}, "at least half of the frames"),
