@@ -22,7 +22,8 @@ from probmotion.lifting.keypoints import (
     smooth_size,
 )
 from probmotion.lifting.result import Lift
-from probmotion.lifting.window_posterior import Observed, WindowPosterior, lift_window
+from probmotion.lifting.window_fit import Observed, lift_window
+from probmotion.lifting.window_posterior import WindowPosterior
 from probmotion.lifting.window_prior import WindowPrior
 from probmotion.models.mixture.spectral_mixture import SpectralMixtureMotion
 from probmotion.motion.motion import KeypointTrack, Motion
@@ -91,7 +92,7 @@ def lift(
     """Return the posterior of a person's 3D motion given the keypoints of one still camera.
 
     The recording is cut into windows of two seconds that overlap by half. Each has a mixture of
-    Gaussian approximations (:mod:`probmotion.lifting.window_posterior`) under the prior
+    Gaussian approximations (:mod:`probmotion.lifting.window_fit`) under the prior
     ``cmu-motion``. Means are averaged with weights that fall linearly to 0 at a window's ends; each
     draw continues from the previous window's. The pitch of the camera and the keypoints' noise are
     those of the largest evidence in three windows.

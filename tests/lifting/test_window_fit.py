@@ -5,7 +5,7 @@ from probmotion.data.synthetic.gaits import make_gait
 from probmotion.geometry.rotations import vector_to_matrix
 from probmotion.lifting.camera import LevelCamera
 from probmotion.lifting.keypoints import PERSON
-from probmotion.lifting.window_posterior import Observed, lift_window
+from probmotion.lifting.window_fit import Observed, lift_window
 
 CAMERA = LevelCamera(900.0, (500.0, 500.0), -0.1)
 

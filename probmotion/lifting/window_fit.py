@@ -1,0 +1,267 @@
+"""Fit of the posterior of a window of motion given the keypoints of one camera.
+
+The prior is a mixture of Gaussians, the camera a pinhole camera, and the noise Student-t. For each
+probable component and heading, the projection is linearised at the current mean (Gauss-Newton) and
+outliers have smaller weights, the expected precisions of the scale mixture. Bones have constant
+lengths: |X_j − X_parent| = l_j (1 + δ_j) ± 1 cm with one unknown δ_j for the window.
+
+Distances to the camera are hardly observed, and the density of all coefficients is largest at a
+motion that is too close and too small: closer motions need smaller deviations from the mean. The
+mode of the marginal density has no such bias. By Laplace's approximation its logarithm has the
+additional term −½ log det H, with the precision H of the coefficients. As a keypoint's information
+is proportional to 1/depth², the gradient of this term is its leverage over depth: a force on each
+joint away from the camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.ndimage import median_filter
+
+from probmotion.lifting.camera import LevelCamera
+from probmotion.lifting.window_posterior import (
+    FLOOR_SPREAD,
+    TEMPER,
+    WindowGaussian,
+    WindowMode,
+    WindowPosterior,
+)
+from probmotion.lifting.window_prior import WindowPrior
+from probmotion.models.mixture.conditioning import rotation
+
+__all__ = ["Observed", "lift_window"]
+
+_FREEDOM = 4.0  # degrees of freedom of the keypoints' noise
+_BONE_NOISE = 0.01  # standard deviation of a bone's length between frames, metres
+_PROPORTIONS = 0.03  # relative standard deviation of a bone's length between people
+_ROUNDS = 4  # of the linearisation
+_SCREENED = 40.0  # nats below the best component at which others are left out
+_FACTORS = (0.72, 0.85, 1.0, 1.18, 1.39)  # of the first estimate of the distance
+_NEAR = 2  # headings of one component that are this close are one candidate
+_WIDE = 3.0  # factor of the noise in the first round
+_SMALL = 1e-4  # probability of modes that are left out
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """Keypoints of a window.
+
+    Parameters
+    ----------
+    points : ndarray, (L, J, 2)
+        Normalised image coordinates (right, up); 0 where missing.
+    weight : ndarray, (L, J)
+        Multiplier of the precision; 0 where missing.
+    noise : float
+        Scale of the noise of a keypoint of weight 1, pixels.
+    """
+
+    points: np.ndarray
+    weight: np.ndarray
+    noise: float
+
+
+def lift_window(
+    prior: WindowPrior,
+    camera: LevelCamera,
+    seen: Observed,
+    middle: np.ndarray,
+    depth: np.ndarray,
+    *,
+    candidates: int = 3,
+    tilt: float = 0.0,
+) -> WindowPosterior:
+    """Return the posterior of a window.
+
+    Parameters
+    ----------
+    prior : WindowPrior
+    camera : LevelCamera
+    seen : Observed
+    middle : ndarray, (L, 2)
+        Middle of the body, normalised image coordinates.
+    depth : ndarray, (L,)
+        First estimate of the body's distance, metres.
+    candidates : int
+        Number of components and headings that are refined.
+    tilt : float
+        Standard deviation of the camera's pitch about the given one, radians; 0 if it is known.
+    """
+    factor, chosen = _screened(prior, camera, seen, middle, depth, candidates)
+    path = camera.points(middle, factor * depth)
+    origin = _below(path)
+    modes = [_refined(prior, camera, seen, path, origin, k, yaw, tilt) for k, yaw in chosen]
+    best = max(mode.score for mode in modes)
+    kept = [mode for mode in modes if TEMPER * (mode.score - best) > np.log(_SMALL)]
+    return WindowPosterior(prior, origin, tuple(kept))
+
+
+def _below(path: np.ndarray) -> np.ndarray:
+    """Return the point a metre below the mean of a body's middle: about the floor, (3,)."""
+    below: np.ndarray = path.mean(axis=0) - [0.0, 1.0, 0.0]
+    return below
+
+
+def _without_gaps(seen: Observed, middle: np.ndarray) -> tuple[np.ndarray, list[int]]:
+    """Return the keypoints of the window's visible joints without gaps, (L, n, 2), and joints."""
+    visible = seen.weight > 0
+    joints = np.flatnonzero(visible.any(axis=0)).tolist()
+    times = np.arange(len(visible))
+    filled = np.repeat(middle[:, None], len(joints), axis=1)
+    for column, joint in enumerate(joints):
+        rows = np.flatnonzero(visible[:, joint])
+        for i in range(2):
+            offset = np.interp(times, rows, seen.points[rows, joint, i] - middle[rows, i])
+            filled[:, column, i] += median_filter(offset, 5, mode="nearest")
+    return filled, joints
+
+
+def _screened(
+    prior: WindowPrior,
+    camera: LevelCamera,
+    seen: Observed,
+    middle: np.ndarray,
+    depth: np.ndarray,
+    candidates: int,
+) -> tuple[float, list[tuple[int, int]]]:
+    """Return the best factor of the depth, and probable components with their headings."""
+    A = len(prior.yaws)
+    filled, joints = _without_gaps(seen, middle)
+    if not joints:  # nobody is visible: draws continue those of the window before
+        return 1.0, [(k, 0) for k in np.argsort(-prior.log_weights)[:candidates].tolist()]
+    turn = round(np.arctan(middle[:, 0].mean()) / (2 * np.pi / A))  # heading relative to the ray
+    best, factor, scores = -np.inf, 1.0, np.zeros((0, 0))
+    for tried in _FACTORS:
+        metres = filled * (tried * depth)[:, None, None]
+        origin = _below(camera.points(middle, tried * depth))
+        # Closer bodies are smaller: the density of pixels needs the Jacobian of metres.
+        values = prior.screen(metres - camera.axes[:2] @ origin, joints, camera.pitch)
+        values = values + 2 * prior.low * len(joints) * np.log(tried)
+        if values.max() > best:
+            best, factor, scores = values.max(), tried, values
+    chosen: list[tuple[int, int]] = []
+    for index in np.argsort(-scores, axis=None).tolist():
+        k, yaw = divmod(index, A)
+        if len(chosen) == candidates or scores[k, yaw] < best - _SCREENED:
+            break
+        yaw = (yaw - turn) % A
+        gaps = [(yaw - other) % A for part, other in chosen if part == k]
+        if all(_NEAR < gap < A - _NEAR for gap in gaps):
+            chosen.append((k, yaw))
+    return factor, chosen
+
+
+def _refined(
+    prior: WindowPrior,
+    camera: LevelCamera,
+    seen: Observed,
+    path: np.ndarray,
+    origin: np.ndarray,
+    k: int,
+    yaw: int,
+    tilt: float,
+) -> WindowMode:
+    """Return the mode of one component and heading."""
+    mean = prior.component(k).mean @ rotation(prior.yaws[yaw]).T
+    pose = mean - mean.mean(axis=1, keepdims=True) + path[:, None]
+    at = np.repeat(path[:, None], mean.shape[1], axis=1)  # weak perspective at first
+    outliers, force = np.full(seen.weight.shape, _WIDE**-2), np.zeros(at.shape)
+    scales = [1.0]
+    visible = seen.weight > 0
+    given, pitch = camera.pitch, 0.0  # pitch: deviation from the given one over its spread
+    mode, leverage = None, None
+    for number in range(_ROUNDS):
+        matrix, target = camera.linearised(at, seen.points)
+        target = target - matrix @ origin
+        # Positions relative to a camera of greater pitch are turned about its right.
+        turn = tilt * (matrix[..., 1] * at[..., 2:] - matrix[..., 2] * at[..., 1:2])
+        target = target + pitch * turn
+        weight = seen.weight * outliers * (camera.focal / (seen.noise * camera.depth(at))) ** 2
+        best = None
+        for scale in prior.scales.tolist() if number == 1 else scales:
+            tried, share = _solved(prior, k, yaw, scale, matrix, target, weight, pose, force, turn)
+            positions = tried.positions + origin
+            turned = replace(camera, pitch=given + tilt * tried.pitch)
+            square = seen.weight * _squares(turned, seen, positions)
+            fit = -0.5 * (_FREEDOM + 2) * np.log1p(square[visible] / _FREEDOM).sum()
+            score = tried.score + fit + prior.log_weights[k]
+            if best is None or score > best.score:
+                best = replace(
+                    tried,
+                    score=score,
+                    positions=positions,
+                    standardised=square,
+                    pitch=turned.pitch,
+                )
+                leverage = share
+        mode = best
+        assert mode is not None
+        assert leverage is not None
+        scales, at, pose = [mode.scale], mode.positions, mode.positions
+        camera = replace(camera, pitch=mode.pitch)
+        pitch = (mode.pitch - given) / tilt if tilt else 0.0
+        outliers = (_FREEDOM + 2) / (_FREEDOM + mode.standardised)
+        force = (leverage / camera.depth(at))[..., None] * camera.axes[2]
+    assert mode is not None
+    return mode
+
+
+def _squares(camera: LevelCamera, seen: Observed, positions: np.ndarray) -> np.ndarray:
+    """Return squared residuals in units of the noise, (L, J)."""
+    residual = (seen.points - camera.project(positions)) * camera.focal / seen.noise
+    square: np.ndarray = (residual**2).sum(axis=-1)
+    return square
+
+
+def _solved(
+    prior: WindowPrior,
+    k: int,
+    yaw: int,
+    scale: float,
+    matrix: np.ndarray,
+    target: np.ndarray,
+    weight: np.ndarray,
+    pose: np.ndarray,
+    force: np.ndarray,
+    turn: np.ndarray,
+) -> tuple[WindowMode, np.ndarray]:
+    """Return the Gaussian posterior of A X = t with given weights, and leverages, (L, J)."""
+    gaussian = WindowGaussian(prior, k, yaw, scale)
+    part, R, sd = gaussian.part, gaussian.rotation, gaussian.deviation
+    L, J = weight.shape
+    r, bones = len(sd), J - 1
+    q, n = r + 2 + bones, 2 * L * J
+    root = np.sqrt(weight)[..., None]
+    turned = (matrix * root[..., None]) @ R
+    design, residual = np.zeros((n + L * bones, q)), np.empty(n + L * bones)
+    design[:n, :r] = ((turned @ part.basis) * sd).reshape(n, r)
+    design[:n, r] = (matrix[..., 1] * root).ravel() * FLOOR_SPREAD
+    design[:n, r + 1] = (turn * root).ravel()
+    residual[:n] = (target * root - (turned @ part.mean[..., None])[..., 0]).ravel()
+    # Bones, linearised along their current directions.
+    along = pose[:, prior.children] - pose[:, prior.parents]
+    along = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), _BONE_NOISE) @ R
+    spread = part.basis[:, prior.children] - part.basis[:, prior.parents]
+    rows = (along[..., None, :] @ spread)[..., 0, :] * sd
+    design[n:, :r] = rows.reshape(L * bones, r) / _BONE_NOISE
+    own = np.arange(L * bones)
+    design[n + own, r + 2 + own % bones] = -np.tile(part.bones, L) * _PROPORTIONS / _BONE_NOISE
+    average = part.mean[:, prior.children] - part.mean[:, prior.parents]
+    residual[n:] = (part.bones - (along * average).sum(axis=-1)).ravel() / _BONE_NOISE
+    precision = design.T @ design
+    precision[np.arange(q), np.arange(q)] += 1.0
+    pull = design.T @ residual
+    pull[:r] += np.tensordot(force @ R, part.basis, axes=3) * sd
+    pull[r] += force[..., 1].sum() * FLOOR_SPREAD
+    lower = np.linalg.cholesky(precision)
+    z = solve_triangular(lower, solve_triangular(lower, pull, lower=True), lower=True, trans=1)
+    half = solve_triangular(lower, design[:n].T, lower=True)
+    leverage = np.einsum("qn,qn->n", half, half).reshape(L, J, 2).sum(axis=-1)
+    stretch = residual[n:] - design[n:] @ z
+    score = -0.5 * (z @ z + stretch @ stretch) - np.log(np.diag(lower)).sum()
+    positions = gaussian.positions(prior, k, z[None], np.arange(L))[0]
+    blank = np.empty((0, 0))
+    return WindowMode(float(score), k, yaw, scale, z, lower, positions, blank, z[r + 1]), leverage
