@@ -45,8 +45,8 @@ class Lift:
     """Horizontal field of view, degrees. Distances from the camera depend on it."""
 
     pitch: Annotated[float | None, arg(metavar="DEGREES", help_behavior_hint="")] = None
-    """Angle of the camera above the horizon, degrees, negative if it looks down; estimated by
-    default, with errors of about 10° in motion unlike that of the prior."""
+    """Angle of the camera above the horizon, degrees, negative if it looks down. Estimated by
+    default, badly for motion unlike that of the prior."""
 
     height: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
     """Height of the person, metres; 1.7 ± .1 by default."""

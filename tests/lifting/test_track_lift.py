@@ -65,7 +65,11 @@ def test_a_given_pitch_is_kept(video, lifted):
 
 def test_taller_people_are_farther_away(video, lifted):
     tall = lift(video.track, image_size=video.size, progress=False, draws=2, height=2.04)
+    usual = lift(video.track, image_size=video.size, progress=False, draws=2, height=1.7)
     assert np.allclose(tall.mean.positions, 1.2 * lifted.mean.positions)
+    assert np.allclose(tall.draws, 1.2 * usual.draws)
+    # Without a height, each draw has its own size.
+    assert not np.allclose(usual.draws, lifted.draws[:2], rtol=0.01)
 
 
 @pytest.mark.parametrize("kind", ["random", "mirrored", "animal"])
