@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 TUTORIALS := $(wildcard notebooks/[0-9]*.py)
 
-.PHONY: install demo test slow lint types notebooks docs bench clean
+.PHONY: install demo test slow fuzz lint types notebooks docs bench clean
 
 install: $(VENV)/.installed
 
@@ -17,12 +17,19 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 
 demo: install
 	@$(BIN)/probmotion compare gait gait-monocular --quick --draws 400 --workers 2 --out demo --report --figures
+	@$(BIN)/probmotion lift notebooks/keypoints/walk.json --image-size 1000 1000 --out demo/lift
+	@$(BIN)/probmotion show demo/lift/lift.npz --figure demo/lift.png
 
 test: install
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m 'not slow' -n 2 --dist worksteal tests
 
 slow: install
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m slow -n 2 --dist worksteal tests
+
+# A million damaged files; "make test" reads ten thousand of them.
+fuzz: install
+	PROBMOTION_FUZZ=1000000 OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 \
+		$(BIN)/python -m pytest -n 2 --dist worksteal tests/fuzz
 
 lint: install
 	$(BIN)/ruff check .

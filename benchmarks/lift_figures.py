@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from single_pose_baseline import single_poses
 
 from probmotion.data.denoising_clips import denoising_clips
 from probmotion.data.synthetic.gaits import make_gait
@@ -24,11 +25,17 @@ FRAMES, VIEWS = 150, 4  # of each clip
 HEIGHTS = (1.0, 2.2)  # of the cameras, metres
 GOOD = 100.0  # largest mean error of lifts that should not be flagged, mm
 MADE = 15  # videos of each kind that must be flagged
+COMPARED = 3  # frames of each video that the baseline lifts
 
 
 def lift_figures(folder: Path) -> Iterator[tuple[str, float]]:
-    """Yield the figures; medians over videos, coverages are means."""
+    """Yield the figures; medians over videos, coverages are means.
+
+    ``lift_all_over_single_pose`` is the ratio of the median errors of the lift and of single poses
+    lifted by joint limits (:mod:`single_pose_baseline`), in the same frames of the same videos.
+    """
     rows: dict[str, list[tuple[float, float, float]]] = {"walk": [], "other": []}
+    compared: dict[str, list[list[float]]] = {"walk": [], "other": []}
     flagged = []
     for number, clip in enumerate(held_out(folder)):
         for view in range(VIEWS):
@@ -40,6 +47,7 @@ def lift_figures(folder: Path) -> Iterator[tuple[str, float]]:
             rows[kind].append(errors(result, video))
             if rows[kind][-1][0] <= GOOD:
                 flagged.append(not result.trusted)
+            compared[kind].append(beside_single_poses(result, video, HEIGHTS[view % 2]))
     walk, every = (np.array(rows["walk"]), np.array(rows["walk"] + rows["other"]))
     yield "lift_walk_mpjpe_mm", float(np.median(walk[:, 0]))
     yield "lift_all_mpjpe_mm", float(np.median(every[:, 0]))
@@ -47,6 +55,11 @@ def lift_figures(folder: Path) -> Iterator[tuple[str, float]]:
     yield "lift_all_coverage_90", float(every[:, 1].mean())
     yield "lift_root_error", float(np.median(every[:, 2]))
     yield "lift_flagged_good", float(np.mean(flagged))
+    for name, values in (("walk", compared["walk"]), ("all", compared["walk"] + compared["other"])):
+        lifts, single, directed = np.nanmedian(values, axis=0)
+        yield f"lift_{name}_single_pose_mpjpe_mm", single
+        yield f"lift_{name}_over_single_pose", lifts / single
+        yield f"lift_{name}_over_single_pose_known_direction", lifts / directed
     bad = bad_videos(folder)
     marks = {kind: [not lifted(video).trusted for video in videos] for kind, videos in bad.items()}
     for kind, values in marks.items():
@@ -79,6 +92,15 @@ def errors(result: Lift, video: Video) -> tuple[float, float, float]:
     path, true_path = (x[:, 0, [0, 2]] for x in (result.mean.positions, truth))
     off = np.linalg.norm(path - true_path, axis=-1).mean()
     return 1000 * distance.mean(), inside.mean(), off / np.linalg.norm(true_path, axis=-1).mean()
+
+
+def beside_single_poses(result: Lift, video: Video, height: float) -> list[float]:
+    """Return the mean errors (mm) of the lift and of single poses without and with direction."""
+    frames = ((np.arange(COMPARED) + 0.5) / COMPARED * video.motion.frames).astype(int)
+    truth = about_hips(video.motion.positions[frames])
+    motions = [result.mean.positions[frames], *single_poses(video, height, frames)]
+    errors = [np.linalg.norm(about_hips(motion) - truth, axis=-1) for motion in motions]
+    return [1000 * float(np.nanmean(error)) for error in errors]
 
 
 def about_hips(positions: np.ndarray) -> np.ndarray:

@@ -17,8 +17,8 @@ from .io.files import (
     save as save,
 )
 from .io.keypoints.files import read_keypoints as read_keypoints
+from .lifting.recording_lift import lift as lift
 from .lifting.result import Lift as Lift
-from .lifting.track_lift import lift as lift
 from .motion.motion import (
     JointTrack as JointTrack,
     KeypointTrack as KeypointTrack,

@@ -7,4 +7,4 @@ from .penetration import (
 )
 from .pose_chart import PoseChart as PoseChart
 from .pose_pairs import PosePairPrior as PosePairPrior
-from .single_pose_lifting import lift_people as lift_people
+from .single_pose_lifting import lift_people as lift_people, lift_person as lift_person

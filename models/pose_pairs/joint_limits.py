@@ -13,7 +13,6 @@ direction. This rotation is undefined only opposite to the mean direction.
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -25,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from probmotion.files import written_whole
+from probmotion.files import read_arrays, written_whole
 from probmotion.models.pose_pairs.joint_limits_kernels import PARTS, LimitArrays, project_poses
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_count, check_finite, check_shape
@@ -33,6 +32,7 @@ from probmotion.validation import check_count, check_finite, check_shape
 __all__ = ["JointLimits", "sphere_rings"]
 
 _PERSON = Skeleton.preset("person17")
+_MAX_RINGS = 1000  # in files; cells are about 1.3 times the square
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,20 +168,21 @@ class JointLimits:
     @classmethod
     def load(cls, path: str | Path) -> JointLimits:
         """Read limits written by :meth:`save`; raise ``ValueError`` if the file is damaged."""
-        content = Path(path).read_bytes()
         try:
-            with np.load(io.BytesIO(content)) as archive:
-                bin_rings, cell_rings = (int(number) for number in archive["rings"])
-                n_cells = len(sphere_rings(cell_rings)[1])
-                return cls(
-                    allowed=np.unpackbits(archive["allowed"], axis=-1, count=n_cells).astype(bool),
-                    rest=archive["rest"],
-                    tilt=float(archive["tilt"]),
-                    bin_rings=bin_rings,
-                    cell_rings=cell_rings,
-                    provenance=json.loads(str(archive["provenance"])),
-                )
-        except Exception as error:  # damaged archives raise many types
+            arrays = read_arrays(path)
+            bin_rings, cell_rings = (int(number) for number in arrays["rings"])
+            if max(bin_rings, cell_rings) > _MAX_RINGS:
+                raise ValueError(f"rings must be at most {_MAX_RINGS}, got {arrays['rings']}")
+            n_cells = len(sphere_rings(cell_rings)[1])
+            return cls(
+                allowed=np.unpackbits(arrays["allowed"], axis=-1, count=n_cells).astype(bool),
+                rest=arrays["rest"],
+                tilt=float(arrays["tilt"]),
+                bin_rings=bin_rings,
+                cell_rings=cell_rings,
+                provenance=json.loads(str(arrays["provenance"])),
+            )
+        except (KeyError, TypeError, ValueError, RecursionError) as error:
             raise ValueError(
                 f"path must be a file written by JointLimits.save, got {str(path)!r}"
             ) from error

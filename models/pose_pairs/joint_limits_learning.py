@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from probmotion.files import read_arrays
 from probmotion.io.files import load
 from probmotion.models.pose_pairs.joint_limits import JointLimits, sphere_rings
 from probmotion.models.pose_pairs.joint_limits_frames import closeness_of
@@ -94,8 +95,8 @@ def learn_limits(
 def clips_of_people(path: Path) -> list[np.ndarray]:
     """Return the positions of each person in a clip, (L, 17, 3), without suspect frames."""
     motion = load(path)
-    with np.load(path) as archive:
-        usable = ~archive["suspect"] if "suspect" in archive else np.ones(motion.frames, bool)
+    suspect = read_arrays(path).get("suspect")
+    usable = np.ones(motion.frames, bool) if suspect is None else ~suspect
     skeleton, people = motion.skeleton, []
     for root in skeleton.roots:
         joints = [j for j in range(skeleton.n_joints) if root in (j, *skeleton.ancestors(j))]

@@ -20,7 +20,7 @@ from probmotion.models.pose_pairs.pose_chart import PoseChart
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_count, check_finite, check_positive, check_shape
 
-__all__ = ["lift_people"]
+__all__ = ["lift_people", "lift_person"]
 
 _STEP = 1e-5  # step of central differences, radians or metres
 
@@ -86,24 +86,59 @@ def lift_people(
     rotated = seed @ np.stack([right, up, np.cross(right, up)], axis=-1)
     aligned = align_rigidly(rotated[:, :2], keypoints, visible)
     positions = np.concatenate([aligned, rotated[:, 2:]], axis=-1)
-    weights = (validity_weight**0.5, seed_weight**0.5)
     for root in skeleton.roots:
         joints = [j for j in range(n_joints) if root in (j, *skeleton.ancestors(j))]
         person = skeleton.subset(joints)
-        chart, observed = PoseChart(positions[joints], person), (keypoints[joints], visible[joints])
-        positions[joints] = _lift_person(chart, *observed, limits.on(person), weights, rounds)
+        positions[joints], _ = lift_person(
+            keypoints[joints],
+            visible[joints],
+            positions[joints],
+            limits.on(person),
+            validity_weight=validity_weight,
+            seed_weight=seed_weight,
+            rounds=rounds,
+        )
     return positions
 
 
-def _lift_person(
-    chart: PoseChart,
+def lift_person(
     keypoints: np.ndarray,
     visible: np.ndarray,
+    start: np.ndarray,
     limits: JointLimits,
-    weights: tuple[float, float],
-    rounds: int,
-) -> np.ndarray:
-    """Return the pose of one person in image axes, (J, 3)."""
+    *,
+    validity_weight: float = 0.01,
+    seed_weight: float = 1e-3,
+    rounds: int = 4,
+    evaluations: int | None = None,
+) -> tuple[np.ndarray, float]:
+    """Lift the 2D pose of one person from an initial pose.
+
+    Parameters
+    ----------
+    keypoints : ndarray, (J, 2)
+        Metres, x right, y up; finite, also where occluded.
+    visible : ndarray of bool, (J,)
+        Mask of annotated joints.
+    start : ndarray, (J, 3)
+        Initial pose in the annotation's axes, metres; determines bone lengths and root depth.
+    limits : JointLimits
+        Joint limits on the person's skeleton.
+    validity_weight, seed_weight, rounds
+        As for :func:`lift_people`.
+    evaluations : int, optional
+        Maximum number of evaluations of the energy per minimisation; unlimited by default, which
+        takes thousands if a keypoint is farther away than the limb is long.
+
+    Returns
+    -------
+    positions : ndarray, (J, 3)
+        Pose in the annotation's axes, metres.
+    energy : float
+        Energy E of the pose, m².
+    """
+    chart = PoseChart(start, limits.skeleton)
+    weights = (validity_weight**0.5, seed_weight**0.5)
     # θ: root rotation (3) and position (3), then two angles and a log length per bone.
     # The root depth and the bone lengths are fixed.
     free = np.delete(np.arange(chart.dim), [5, *range(6 + 2, chart.dim, 3)])
@@ -126,7 +161,15 @@ def _lift_person(
     point = np.zeros(len(free))
     for _ in range(rounds):
         valid = limits.nearest_valid(pose_at(point))
-        point = least_squares(
-            residuals, point, slopes, method="lm", xtol=1e-9, ftol=1e-9, args=(valid,)
-        ).x
-    return pose_at(point)
+        solution = least_squares(
+            residuals,
+            point,
+            slopes,
+            method="lm",
+            xtol=1e-9,
+            ftol=1e-9,
+            max_nfev=evaluations,
+            args=(valid,),
+        )
+        point = solution.x
+    return pose_at(point), 2 * float(solution.cost)

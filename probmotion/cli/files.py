@@ -126,7 +126,8 @@ class Convert(Conventions):
     """Frame rate to resample to, frames per second."""
 
     skeleton: str | None = None
-    """Skeleton to retarget to (see probmotion list)."""
+    """Skeleton to retarget to (see probmotion list). smpl22 has rotations, and joints of the trunk
+    and feet by fixed proportions if IN lacks them."""
 
     draw: int | None = None
     """Index of the draw in the first chain of IN; 0 by default."""
@@ -138,9 +139,13 @@ class Convert(Conventions):
         if self.fps is not None:
             motion = motion.resample(self.fps)
         if self.skeleton is not None:
+            from probmotion.io.smpl import smpl_motion
             from probmotion.motion.skeleton import Skeleton
 
-            motion = motion.retarget(Skeleton.preset(self.skeleton))
+            if self.skeleton == "smpl22":
+                motion = smpl_motion(motion)
+            else:
+                motion = motion.retarget(Skeleton.preset(self.skeleton))
         save(motion, self.target)
         print(f"wrote {self.target}: {motion}")
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+if TYPE_CHECKING:
+    from probmotion.motion.motion import KeypointTrack
 
 __all__ = ["Lift"]
 
@@ -16,18 +19,25 @@ class Lift:
     """Lift a video's 2D keypoints to 3D motion with its uncertainty.
 
     Writes to --out: lift.html (the motion in a browser), lift.bvh and lift.glb (for Blender),
-    lift.npz (mean, standard deviations and draws) and summary.json. With several people each has a
-    folder of its own.
+    lift.npz (mean, standard deviations and draws), lift.smpl22.npz (positions and rotations of
+    SMPL's body joints) and summary.json. With several people each has a folder of its own.
     """
 
-    keypoints: Positional[Path]
-    """Keypoints of one still camera: file or folder of a detector (see probmotion show)."""
+    keypoints: Positional[tuple[Path, ...]]
+    """Keypoints of a still camera: file or folder of a detector (see probmotion show). With
+    --camera also one of every camera, or a folder of Pose2Sim with a folder of every camera."""
 
     out: Path
     """Output folder."""
 
-    image_size: Annotated[tuple[int, int], arg(metavar="WIDTH HEIGHT")]
-    """Size of the video, pixels."""
+    image_size: Annotated[
+        tuple[int, int] | None, arg(metavar="WIDTH HEIGHT", help_behavior_hint="")
+    ] = None
+    """Size of the video, pixels; required without --camera."""
+
+    camera: Annotated[Path | None, arg(metavar="TOML", help_behavior_hint="")] = None
+    """Calibration of Pose2Sim: the motion is in its world. Files and folders are named after its
+    cameras or in their order."""
 
     fps: float | None = None
     """Frame rate, frames per second; the file's by default."""
@@ -41,8 +51,8 @@ class Lift:
     person: int | None = None
     """Index of the person to lift; all by default."""
 
-    fov: float = 60.0
-    """Horizontal field of view, degrees. Distances from the camera depend on it."""
+    fov: Annotated[float | None, arg(metavar="DEGREES", help_behavior_hint="")] = None
+    """Horizontal field of view, degrees; 60 by default. Distances from the camera depend on it."""
 
     pitch: Annotated[float | None, arg(metavar="DEGREES", help_behavior_hint="")] = None
     """Angle of the camera above the horizon, degrees, negative if it looks down. Estimated by
@@ -62,23 +72,18 @@ class Lift:
 
     def run(self) -> None:
         from probmotion.files import writable_folder
-        from probmotion.io.keypoints.files import read_keypoints
-        from probmotion.lifting.track_lift import lift
+        from probmotion.lifting.recording_lift import lift
 
-        size = (float(self.image_size[0]), float(self.image_size[1]))
-        tracks = read_keypoints(self.keypoints, self.fps, self.skeleton, self.people, size)
-        if self.person is not None:
-            if not 0 <= self.person < len(tracks):
-                raise ValueError(f"person must be 0 to {len(tracks) - 1}, got {self.person}")
-            tracks = [tracks[self.person]]
+        people = self._people()
         writable_folder(self.out)
         doubtful, refused = [], []
-        for number, track in enumerate(tracks):
-            folder = self.out if len(tracks) == 1 else self.out / f"person-{number}"
+        for number, tracks in enumerate(people):
+            folder = self.out if len(people) == 1 else self.out / f"person-{number}"
             try:
                 result = lift(
-                    track,
+                    tracks,
                     image_size=self.image_size,
+                    camera=self.camera,
                     fov=self.fov,
                     pitch=self.pitch,
                     height=self.height,
@@ -86,20 +91,55 @@ class Lift:
                     seed=self.seed,
                 )
             except ValueError as error:
-                if len(tracks) == 1:
+                if len(people) == 1:
                     raise
                 refused.append(error)
                 print(f"person {number} was not lifted: {error}")
                 continue
             result.save(folder)
             print("\n".join(result.summary()))
-            print(f"wrote {folder / 'lift.html'}, lift.bvh, lift.glb, lift.npz, summary.json")
+            print(
+                f"wrote {folder / 'lift.html'}, lift.bvh, lift.glb, lift.npz, lift.smpl22.npz, "
+                "summary.json"
+            )
             if not result.trusted:
                 doubtful.append(str(folder))
-        if len(refused) == len(tracks):
+        if len(refused) == len(people):
             raise refused[0]
         if self.strict and doubtful:
             raise ValueError(
                 f"motions must pass all checks with --strict, got failures in "
                 f"{', '.join(doubtful)}; see lift.html"
             )
+
+    def _people(self) -> list[list[KeypointTrack]]:
+        """Return the tracks of every person, one a camera."""
+        from probmotion.io.keypoints.calibration import view_folders
+
+        paths = list(self.keypoints)
+        if self.camera is not None and len(paths) == 1:
+            paths = view_folders(paths[0])
+        if self.camera is None and len(paths) > 1:
+            raise ValueError(f"camera must be given for several files, got {len(paths)} files")
+        views = [self._tracks(path) for path in paths]
+        if len(views) == 1:
+            return [[track] for track in views[0]]
+        for path, tracks in zip(paths, views, strict=True):
+            if len(tracks) != 1:
+                raise ValueError(
+                    f"keypoints of several cameras must be of one person, got {len(tracks)} in "
+                    f"{path}; associate people before (pose-associated of Pose2Sim)"
+                )
+        return [[tracks[0] for tracks in views]]
+
+    def _tracks(self, path: Path) -> list[KeypointTrack]:
+        """Return the tracks of a camera, with its file's name if there is a calibration."""
+        from probmotion.io.keypoints.files import read_keypoints
+
+        size = None if self.image_size is None else (self.image_size[0], self.image_size[1])
+        tracks = read_keypoints(path, self.fps, self.skeleton, self.people, size)
+        if self.person is not None:
+            if not 0 <= self.person < len(tracks):
+                raise ValueError(f"person must be 0 to {len(tracks) - 1}, got {self.person}")
+            tracks = [tracks[self.person]]
+        return tracks if self.camera is None else [replace(t, name=path.stem) for t in tracks]

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from probmotion import seeds
+from probmotion.geometry.cameras import Cameras
 from probmotion.geometry.rotations import vector_to_matrix
 from probmotion.motion.motion import KeypointTrack, Motion
 from probmotion.motion.skeleton import Skeleton
@@ -27,12 +28,14 @@ class Video(NamedTuple):
     """Keypoints of a video and the truth.
 
     ``track`` contains COCO's keypoints without the face; ``motion`` the true motion on ``person14``
-    in the axes right, up and backwards, with the camera at 0; ``size`` width and height.
+    in the axes right, up and backwards, with the camera at 0; ``size`` width and height;
+    ``camera`` is the camera in the world of the clip.
     """
 
     track: KeypointTrack
     motion: Motion
     size: tuple[int, int]
+    camera: Cameras
 
 
 def film(clip: Motion, seed: int, *, azimuth: float, height: float = 1.0) -> Video:
@@ -54,13 +57,15 @@ def film(clip: Motion, seed: int, *, azimuth: float, height: float = 1.0) -> Vid
     """
     rng = seeds.generator(seed, "film")
     person = clip.retarget(Skeleton.preset("person14"))
-    world = person.positions @ vector_to_matrix(np.array([0.0, azimuth, 0.0])).T
+    turn = vector_to_matrix(np.array([0.0, azimuth, 0.0]))
+    world = person.positions @ turn.T
     ground = world[..., [0, 2]].reshape(-1, 2)
     middle = (ground.max(axis=0) + ground.min(axis=0)) / 2
     reach = np.abs(ground - middle).max(axis=0)
     half = _MARGIN * _SIZE / (2 * _FOCAL)
     distance = max(reach[0], _REACH) / half + reach[1]
-    positions = world - [middle[0], height, middle[1] + distance]
+    place = np.array([middle[0], height, middle[1] + distance])
+    positions = world - place
     pitch = np.arctan2(1.0 - height, distance)
     forward = np.array([0.0, np.sin(pitch), -np.cos(pitch)])
     up = np.array([0.0, np.cos(pitch), np.sin(pitch)])
@@ -86,7 +91,10 @@ def film(clip: Motion, seed: int, *, azimuth: float, height: float = 1.0) -> Vid
             confidence[:, joint] = seen[:, origin]
     track = KeypointTrack(keypoints, confidence, coco, clip.fps, clip.name)
     truth = Motion(positions, person.skeleton, clip.fps, name=clip.name)
-    return Video(track, truth, (_SIZE, _SIZE))
+    axes = np.stack([[1.0, 0.0, 0.0], -up, forward])[None]
+    centre = np.full((1, 2), _SIZE / 2)
+    camera = Cameras(axes @ turn, -axes @ place, np.array([_FOCAL]), centre, orthographic=False)
+    return Video(track, truth, (_SIZE, _SIZE), camera)
 
 
 def quadruped_as_person(gait: Motion) -> Motion:

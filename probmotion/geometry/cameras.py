@@ -166,10 +166,14 @@ class Cameras:
 
     def view(self, index: int) -> Cameras:
         """Return one camera as a batch of one."""
+        return self.views([index])
+
+    def views(self, indices: list[int]) -> Cameras:
+        """Return some of the cameras."""
         assert self.centre is not None
-        one = [index]
-        rotation, translation = self.rotation[one], self.translation[one]
-        return Cameras(rotation, translation, self.focal[one], self.centre[one], self.orthographic)
+        rotation, translation = self.rotation[indices], self.translation[indices]
+        focal, centre = self.focal[indices], self.centre[indices]
+        return Cameras(rotation, translation, focal, centre, self.orthographic)
 
     def as_orthographic(self) -> Cameras:
         """Return orthographic cameras with the same scale at the depth of the world origin."""

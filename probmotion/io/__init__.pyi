@@ -20,4 +20,5 @@ from .npz import (
 )
 from .predictions import read_predictions as read_predictions
 from .recordings import Recording as Recording, read_recording as read_recording
+from .smpl import smpl_motion as smpl_motion
 from .tables import write_csv as write_csv, write_trc as write_trc

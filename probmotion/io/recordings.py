@@ -22,7 +22,7 @@ from probmotion.validation import check_finite, check_shape
 
 __all__ = ["Recording", "read_recording"]
 
-_FIXED_POINT_STEPS = 5  # of the inversion of lens distortion
+_FIXED_POINT_STEPS = 20  # of the inversion of lens distortion
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,9 +160,10 @@ def undistorted(
 ) -> np.ndarray:
     """Remove lens distortion: return pixels (V, L, J, 2) of the pinhole ``cameras``.
 
-    A lens with coefficients k₁, k₂, p₁, p₂ (V, 4) maps normalised x, with r² = x² + y², to
+    A lens with coefficients k₁, k₂, p₁, p₂ and, optionally, k₃ (V, 4 or 5) maps normalised x, with
+    r² = x² + y², to
 
-        x (1 + k₁ r² + k₂ r⁴) + 2 p₁ x y + p₂ (r² + 2 x²),
+        x (1 + k₁ r² + k₂ r⁴ + k₃ r⁶) + 2 p₁ x y + p₂ (r² + 2 x²),
 
     and likewise y, with p₁ and p₂ exchanged (OpenCV's documentation of the pinhole model).
     Intrinsics ``K`` (V, 3, 3) normalise keypoints; fixed-point iteration inverts the map.
@@ -170,7 +171,8 @@ def undistorted(
     assert cameras.centre is not None
     focal, centre = K[:, None, None, [0, 1], [0, 1]], K[:, None, None, :2, 2]
     distorted = (keypoints - centre) / focal
-    k1, k2, p1, p2 = distortion.T[:, :, None, None]
+    k1, k2, p1, p2 = distortion.T[:4, :, None, None]
+    k3 = distortion[:, 4:].sum(axis=1)[:, None, None]
     normalised = distorted
     for _ in range(_FIXED_POINT_STEPS):
         x, y = normalised[..., 0], normalised[..., 1]
@@ -178,7 +180,8 @@ def undistorted(
         along_x = 2 * p1 * x * y + p2 * (square + 2 * x**2)
         along_y = 2 * p2 * x * y + p1 * (square + 2 * y**2)
         tangential = np.stack([along_x, along_y], axis=-1)
-        normalised = (distorted - tangential) / (1 + k1 * square + k2 * square**2)[..., None]
+        radial = 1 + k1 * square + k2 * square**2 + k3 * square**3
+        normalised = (distorted - tangential) / radial[..., None]
     return normalised * cameras.focal[:, None, None, None] + cameras.centre[:, None, None, :]
 
 

@@ -1,2 +1,2 @@
+from .recording_lift import lift as lift
 from .result import Lift as Lift
-from .track_lift import lift as lift

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from probmotion.lifting.camera import LevelCamera
-from probmotion.lifting.keypoints import PERSON, PersonKeypoints
+from probmotion.lifting.keypoints import PERSON, PersonKeypoints, averaged
 from probmotion.lifting.window_posterior import WindowPosterior
 
 __all__ = ["MEDIAN", "Check", "Evidence", "checked"]
@@ -44,13 +44,14 @@ class Check:
 
 
 class Evidence(NamedTuple):
-    """Keypoints, camera, noise (pixels), mean (L, J, 3) and posteriors of the windows.
+    """Keypoints, frame rate, camera, noise (pixels), mean (L, J, 3) and windows' posteriors.
 
     ``mirrored`` is the log evidence per window of keypoints with exchanged sides, minus that of the
     given ones.
     """
 
     keypoints: PersonKeypoints
+    fps: float
     camera: LevelCamera
     noise: float
     mean: np.ndarray
@@ -58,18 +59,22 @@ class Evidence(NamedTuple):
     mirrored: float
 
 
+_ANKLES, _HIPS = (
+    [PERSON.joint_names.index(f"{side}_{part}") for side in ("left", "right")]
+    for part in ("ankle", "hip")
+)
+_STEP, _LAG = 1 / 15, 2  # keypoints are averaged over _STEP seconds and compared _LAG steps apart
 _FEWEST, _SHARE = 10, 0.1  # visible frames of the joints whose residuals are checked
 # Limits were chosen on made videos of training and validation clips.
 _LIMITS = {
     "noise": (0.04, "the keypoints' noise is more than 4 cm at the person's distance"),
-    "residual": (
-        1.35,
-        "keypoints of a joint do not follow a body before a still camera (does the camera move?)",
-    ),
-    "surprise": (1.5, "the motion is unlike those from which the prior was learnt"),
+    "residual": (1.6, "keypoints of a joint do not follow a body before a still camera"),
+    "unsteady": (0.5, "feet and body move to and fro together (does the camera move?)"),
+    "posture": (1.8, "the posture is unlike those from which the prior was learnt"),
+    "surprise": (2.5, "the motion is unlike those from which the prior was learnt"),
     "proportions": (3.0, "the body has unusual proportions (another animal, swapped joints?)"),
     "mirrored": (
-        80.0,
+        0.0,
         "the motion is more likely with left and right exchanged (is the video mirrored?)",
     ),
 }
@@ -79,17 +84,20 @@ def checked(evidence: Evidence) -> tuple[Check, ...]:
     """Return all checks.
 
     ``noise``: that of keypoints, in metres at the person's distance. ``residual``: largest ratio of
-    a joint's robust residuals to the noise. ``surprise`` and ``proportions``: mean
-    squares of standardised coefficients of the motion and of bone lengths. ``mirrored``: log
-    evidence per window of exchanged sides.
+    a joint's robust residuals to the noise. ``unsteady``: speed of a motion that feet and body have
+    in common, metres per second. ``posture``, ``surprise`` and ``proportions``: mean squares of
+    standardised coefficients of the mean posture, of the motion and of bone lengths. ``mirrored``:
+    log evidence per window of exchanged sides.
     """
     points, weight, _ = evidence.keypoints
     residual = np.linalg.norm(points - evidence.camera.pixels(evidence.mean), axis=-1)
     standardised = residual * np.sqrt(weight) / evidence.noise
+    counts = (standardised > 0).sum(axis=0)
+    enough = min(max(_FEWEST, _SHARE * len(points)), counts.max())
     joints = [
         float(np.sqrt(np.median(values[values > 0] ** 2) / MEDIAN))
-        for values in standardised.T
-        if (values > 0).sum() >= max(_FEWEST, _SHARE * len(values))
+        for values, count in zip(standardised.T, counts, strict=True)
+        if count >= enough
     ]
     depth = evidence.camera.depth(evidence.mean).mean()
     bones = PERSON.n_joints - 1
@@ -99,6 +107,8 @@ def checked(evidence: Evidence) -> tuple[Check, ...]:
     values = {
         "noise": evidence.noise * depth / evidence.camera.focal,
         "residual": max(joints),
+        "unsteady": _unsteadiness(evidence),
+        "posture": np.median([best.posture for best in bests]),
         "surprise": np.median(surprise),
         "proportions": np.median(proportions),
         "mirrored": evidence.mirrored,
@@ -107,3 +117,24 @@ def checked(evidence: Evidence) -> tuple[Check, ...]:
         Check(name, float(values[name]), limit, problem)
         for name, (limit, problem) in _LIMITS.items()
     )
+
+
+def _unsteadiness(evidence: Evidence) -> float:
+    """Return how fast feet and body move to and fro in the image, metres per second.
+
+    It is the smaller of the slower ankle's median speed and of the hips' median deviation from
+    their median velocity: of people before a still camera, a foot stands still most of the time,
+    or they run steadily.
+    """
+    step = max(1, round(evidence.fps * _STEP))
+    points, weight, _ = averaged(evidence.keypoints, step)
+    distance = evidence.camera.depth(evidence.mean).mean(axis=1)[step // 2 :: step][: len(points)]
+    scale = distance[_LAG:, None, None] / evidence.camera.focal * evidence.fps / (_LAG * step)
+    velocity = (points[_LAG:] - points[:-_LAG]) * scale
+    seen = ((weight[_LAG:] > 0) & (weight[:-_LAG] > 0))[:, _ANKLES + _HIPS].all(axis=1)
+    if not seen.any():
+        return 0.0
+    slower = np.linalg.norm(velocity[seen][:, _ANKLES], axis=-1).min(axis=1)
+    hips = velocity[seen][:, _HIPS].mean(axis=1)
+    varying = np.linalg.norm(hips - np.median(hips, axis=0), axis=-1)
+    return float(min(np.median(slower), np.median(varying)))

@@ -12,7 +12,8 @@ from probmotion.motion.retargeting import counterpart
 from probmotion.motion.skeleton import Skeleton
 
 __all__ = [
-    "BodyPath", "PersonKeypoints", "averaged", "body_path", "person_keypoints", "smooth_size",
+    "SIDED", "BodyPath", "PersonKeypoints", "averaged", "body_path", "person_keypoints",
+    "smooth_size",
 ]  # fmt: skip
 
 PERSON = Skeleton.preset("person14")
@@ -20,7 +21,8 @@ PERSON = Skeleton.preset("person14")
 _TRUNK = ("neck", "pelvis")
 LIMBS = [j for j, name in enumerate(PERSON.joint_names) if name not in _TRUNK]
 """Joints of arms and legs."""
-_GROUPS = (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"))
+SIDED = (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"))
+"""Joints of an arm and of a leg."""
 _SWAP_COST = 1.5  # of a second with exchanged sides, in units of a frame's typical motion
 _CAPPED = 5.0  # largest cost of a step, in the same units
 _LENGTHS = {"elbow": 0.28, "wrist": 0.21, "knee": 0.42, "ankle": 0.41}  # bone lengths, metres
@@ -80,7 +82,7 @@ def _unswapped(points: np.ndarray, weight: np.ndarray, cost: float) -> PersonKey
     """
     points, weight = points.copy(), weight.copy()
     swapped = []
-    for group in _GROUPS:
+    for group in SIDED:
         left, right = (
             [PERSON.joint_names.index(f"{side}_{name}") for name in group]
             for side in ("left", "right")

@@ -46,8 +46,8 @@ def lift_page(
     draws : ndarray, (n, L, J, 3)
         Posterior draws, metres.
     cameras : Cameras
-        The camera.
-    keypoints : ndarray, (L, J, 2)
+        The V cameras; the animation shows the view with the most keypoints.
+    keypoints : ndarray, (V, L, J, 2)
         Keypoints, pixels; NaN where missing.
     checks : sequence of Check
     sentences : sequence of str
@@ -57,7 +57,10 @@ def lift_page(
     step = max(1, -(-motion.frames // _FRAMES))
     # Spread about a common root: the distance from the camera would hide that of the pose.
     shown_draws = draws[:_DRAWS] - draws[:_DRAWS, :, :1] + motion.positions[None, :, :1]
-    problem = StoredProblem(motion.skeleton, motion.fps, True, camera=cameras, keypoints=keypoints)
+    view = int(np.isfinite(keypoints).sum(axis=(1, 2, 3)).argmax())
+    problem = StoredProblem(
+        motion.skeleton, motion.fps, True, camera=cameras.view(view), keypoints=keypoints[view]
+    )
     rows = {"lift": np.concatenate([motion.positions[None], shown_draws])}
     shown = Shown(problem, rows, step, overlaid=True)
     captions = {"lift": "mean and three draws; joints coloured by their standard deviation"}
@@ -69,7 +72,8 @@ def lift_page(
     )
     mark = "good" if all(check.passed for check in checks) else "bad"
     summary = "".join(f"<p>{escape(sentence)}</p>" for sentence in sentences)
-    title = escape(f"{name}: 3D motion from one camera")
+    count = "one camera" if cameras.n_views == 1 else f"{cameras.n_views} cameras"
+    title = escape(f"{name}: 3D motion from {count}")
     # The policy blocks external resources.
     policy = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
     return f"""\

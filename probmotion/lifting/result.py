@@ -13,6 +13,7 @@ from probmotion.files import writable_folder, written_whole
 from probmotion.geometry.cameras import Cameras
 from probmotion.io.files import save
 from probmotion.io.npz import write_npz
+from probmotion.io.smpl import smpl_motion
 from probmotion.lifting.camera import LevelCamera
 from probmotion.lifting.checks import Check
 from probmotion.lifting.page import lift_page
@@ -24,10 +25,11 @@ __all__ = ["Lift"]
 
 @dataclass(frozen=True, eq=False)
 class Lift:
-    """Posterior of a person's motion given one camera's keypoints.
+    """Posterior of a person's motion given the keypoints of V cameras.
 
-    The world's axes are the image's right, up, and towards the camera, which is at
-    (0, ``camera_height``, 0); the floor is y = 0.
+    Without a calibration, the world's axes are the image's right, up, and towards the camera, which
+    is at (0, ``camera_height``, 0); the floor is y = 0. With one, they are those of the
+    calibration, turned to y up: (x, z, -y) of its file.
 
     Parameters
     ----------
@@ -35,15 +37,15 @@ class Lift:
         Posterior mean on ``person14``.
     draws : ndarray, (n, L, J, 3)
         Posterior draws, metres.
-    camera : LevelCamera
-        Focal length, principal point and pitch.
-    camera_height : float
-        Height of the camera above the floor, metres.
+    cameras : Cameras
+        The V cameras, without lens distortion.
+    camera_names : tuple of str
+        Names of calibrated cameras; empty without a calibration.
     noise : float
         Scale of the keypoints' noise, pixels.
-    keypoints : ndarray, (L, J, 2)
-        Keypoints that were used, pixels; 0 where missing.
-    weight : ndarray, (L, J)
+    keypoints : ndarray, (V, L, J, 2)
+        Keypoints that were used, undistorted, pixels; 0 where missing.
+    weight : ndarray, (V, L, J)
         Multiplier of their precision; 0 where missing.
     swapped : float
         Share of arms and legs whose sides were exchanged before lifting.
@@ -53,8 +55,8 @@ class Lift:
 
     mean: Motion
     draws: np.ndarray
-    camera: LevelCamera
-    camera_height: float
+    cameras: Cameras
+    camera_names: tuple[str, ...]
     noise: float
     keypoints: np.ndarray
     weight: np.ndarray
@@ -68,13 +70,24 @@ class Lift:
         return deviation
 
     @property
-    def cameras(self) -> Cameras:
-        """The camera, as a batch of one."""
-        right, up, forward = self.camera.axes
-        rotation = np.stack([right, -up, forward])
-        translation = -rotation @ [0.0, self.camera_height, 0.0]
-        focal, centre = np.array([self.camera.focal]), np.array([self.camera.centre])
-        return Cameras(rotation[None], translation[None], focal, centre, orthographic=False)
+    def camera(self) -> LevelCamera:
+        """Focal length, principal point and pitch of the first camera."""
+        assert self.cameras.centre is not None
+        x, y = self.cameras.centre[0]
+        pitch = -float(self.cameras.elevation[0])
+        return LevelCamera(float(self.cameras.focal[0]), (float(x), float(y)), pitch)
+
+    @property
+    def camera_positions(self) -> np.ndarray:
+        """Positions of the cameras, (V, 3), metres."""
+        rotation, translation = self.cameras.rotation, self.cameras.translation
+        positions: np.ndarray = -np.einsum("vij,vi->vj", rotation, translation)
+        return positions
+
+    @property
+    def camera_height(self) -> float:
+        """Height of the first camera above the floor, or above 0 of a calibration, metres."""
+        return float(self.camera_positions[0, 1])
 
     @property
     def trusted(self) -> bool:
@@ -93,13 +106,25 @@ class Lift:
             f"pelvis (largest joint: {spread.mean(axis=0).max():.0f} mm), and keypoints a noise of "
             f"{self.noise:.1f} pixels."
         )
-        distance = np.linalg.norm(self.mean.positions[:, 0, [0, 2]], axis=-1)
-        camera = (
+        return [trust, precision, self._filmed()]
+
+    def _filmed(self) -> str:
+        """Return the sentence on the cameras."""
+        path = self.mean.positions[None, :, 0] - self.camera_positions[:, None]
+        if self.camera_names:
+            distance = np.linalg.norm(path, axis=-1)
+            count = len(self.camera_names)
+            return (
+                f"Positions are in the world of the calibration, and the person is "
+                f"{distance.min():.1f} to {distance.max():.1f} m from the {count} "
+                f"camera{'s' if count > 1 else ''} ({', '.join(self.camera_names)})."
+            )
+        distance = np.linalg.norm(path[..., [0, 2]], axis=-1)
+        return (
             f"The camera is {self.camera_height:.2f} m above the floor and looks "
             f"{abs(np.degrees(self.camera.pitch)):.0f}° {'up' if self.camera.pitch > 0 else 'down'}"
             f"; the person is {distance.min():.1f} to {distance.max():.1f} m away."
         )
-        return [trust, precision, camera]
 
     def report(self, path: str | Path) -> Path:
         """Write an HTML page with the summary and the motion, and return its path."""
@@ -113,10 +138,11 @@ class Lift:
         return path
 
     def save(self, folder: str | Path) -> None:
-        """Write the page, the mean as BVH and GLB, all draws, and a summary to a folder.
+        """Write the page, the mean as BVH, GLB and on SMPL's joints, all draws, and a summary.
 
         The files are ``lift.html``, ``lift.bvh``, ``lift.glb``, ``lift.npz`` (mean, standard
-        deviations and draws) and ``summary.json``.
+        deviations and draws), ``lift.smpl22.npz``
+        (:func:`~probmotion.io.smpl.smpl_motion` of the mean) and ``summary.json``.
         """
         folder = Path(folder)
         writable_folder(folder)
@@ -124,6 +150,7 @@ class Lift:
         rigid = rigid_motion(self.mean)
         save(rigid, folder / "lift.bvh")
         save(rigid, folder / "lift.glb")
+        save(smpl_motion(self.mean), folder / "lift.smpl22.npz")
         write_npz(self.mean, folder / "lift.npz", {"sd": self.sd, "draws": self.draws})
         content = {
             "trusted": self.trusted,
@@ -132,12 +159,23 @@ class Lift:
                 check.name: {"value": check.value, "limit": check.limit, "passed": check.passed}
                 for check in self.checks
             },
-            "camera": {
-                "focal": self.camera.focal,
-                "centre": list(self.camera.centre),
-                "pitch_degrees": float(np.degrees(self.camera.pitch)),
-                "height": self.camera_height,
-            },
+            "cameras": [
+                {
+                    "name": name,
+                    "focal": focal,
+                    "centre": centre,
+                    "pitch_degrees": -float(np.degrees(elevation)),
+                    "position": position,
+                }
+                for name, focal, centre, elevation, position in zip(
+                    self.camera_names or ("",),
+                    self.cameras.focal.tolist(),
+                    np.asarray(self.cameras.centre).tolist(),
+                    self.cameras.elevation,
+                    self.camera_positions.tolist(),
+                    strict=True,
+                )
+            ],
             "noise_pixels": self.noise,
             "swapped_share": self.swapped,
         }

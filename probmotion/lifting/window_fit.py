@@ -1,4 +1,4 @@
-"""Fit of the posterior of a window of motion given the keypoints of one camera.
+"""Fit of the posterior of a window of motion given the keypoints of one or several cameras.
 
 The prior is a mixture of Gaussians, the camera a pinhole camera, and the noise Student-t. For each
 probable component and heading, the projection is linearised at the current mean (Gauss-Newton) and
@@ -21,7 +21,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.ndimage import median_filter
 
-from probmotion.lifting.camera import LevelCamera
+from probmotion.lifting.camera import LevelCamera, LevelCameras
 from probmotion.lifting.window_posterior import (
     FLOOR_SPREAD,
     TEMPER,
@@ -32,11 +32,12 @@ from probmotion.lifting.window_posterior import (
 from probmotion.lifting.window_prior import WindowPrior
 from probmotion.models.mixture.conditioning import rotation
 
-__all__ = ["Observed", "lift_window"]
+__all__ = ["PROPORTIONS", "Observed", "lift_window", "lift_window_views"]
 
+PROPORTIONS = 0.03
+"""Relative standard deviation of a bone's length between people."""
 _FREEDOM = 4.0  # degrees of freedom of the keypoints' noise
 _BONE_NOISE = 0.01  # standard deviation of a bone's length between frames, metres
-_PROPORTIONS = 0.03  # relative standard deviation of a bone's length between people
 _ROUNDS = 4  # of the linearisation
 _SCREENED = 40.0  # nats below the best component at which others are left out
 _FACTORS = (0.72, 0.85, 1.0, 1.18, 1.39)  # of the first estimate of the distance
@@ -47,13 +48,13 @@ _SMALL = 1e-4  # probability of modes that are left out
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """Keypoints of a window.
+    """Keypoints of a window in one view, or in V views as a first axis.
 
     Parameters
     ----------
-    points : ndarray, (L, J, 2)
+    points : ndarray, (L, J, 2) or (V, L, J, 2)
         Normalised image coordinates (right, up); 0 where missing.
-    weight : ndarray, (L, J)
+    weight : ndarray, (L, J) or (V, L, J)
         Multiplier of the precision; 0 where missing.
     noise : float
         Scale of the noise of a keypoint of weight 1, pixels.
@@ -92,6 +93,55 @@ def lift_window(
     """
     factor, chosen = _screened(prior, camera, seen, middle, depth, candidates)
     path = camera.points(middle, factor * depth)
+    return _posterior(prior, camera, seen, path, chosen, tilt)
+
+
+def lift_window_views(
+    prior: WindowPrior,
+    cameras: LevelCameras,
+    seen: Observed,
+    path: np.ndarray,
+    *,
+    candidates: int = 3,
+) -> WindowPosterior:
+    """Return the posterior of a window given several cameras.
+
+    Parameters
+    ----------
+    prior : WindowPrior
+    cameras : LevelCameras
+    seen : Observed
+        Keypoints of V views.
+    path : ndarray, (L, 3)
+        First estimate of the path of the body's middle, metres.
+    candidates : int
+        Number of components and headings that are refined.
+    """
+    A = len(prior.yaws)
+    scores = []
+    for camera, points, weight in zip(cameras.views, seen.points, seen.weight, strict=True):
+        middle = camera.project(path)
+        filled, joints = _without_gaps(Observed(points, weight, seen.noise), middle)
+        if joints:
+            metres = filled * camera.depth(path)[:, None, None]
+            origin = camera.axes[:2] @ (_below(path) - camera.position)
+            turn = np.arctan(middle[:, 0].mean()) - camera.heading
+            values = prior.screen(metres - origin, joints, camera.pitch)
+            scores.append(np.roll(values, -round(turn / (2 * np.pi / A)), axis=1))
+    # The mean: errors of the views due to what the screening neglects are not independent.
+    chosen = _distinct(np.mean(scores, axis=0), candidates) if scores else _usual(prior, candidates)
+    return _posterior(prior, cameras, seen, path, chosen, 0.0)
+
+
+def _posterior(
+    prior: WindowPrior,
+    camera: LevelCamera | LevelCameras,
+    seen: Observed,
+    path: np.ndarray,
+    chosen: list[tuple[int, int]],
+    tilt: float,
+) -> WindowPosterior:
+    """Return the posterior with the modes of chosen components and headings."""
     origin = _below(path)
     modes = [_refined(prior, camera, seen, path, origin, k, yaw, tilt) for k, yaw in chosen]
     best = max(mode.score for mode in modes)
@@ -130,8 +180,8 @@ def _screened(
     """Return the best factor of the depth, and probable components with their headings."""
     A = len(prior.yaws)
     filled, joints = _without_gaps(seen, middle)
-    if not joints:  # nobody is visible: draws continue those of the window before
-        return 1.0, [(k, 0) for k in np.argsort(-prior.log_weights)[:candidates].tolist()]
+    if not joints:
+        return 1.0, _usual(prior, candidates)
     turn = round(np.arctan(middle[:, 0].mean()) / (2 * np.pi / A))  # heading relative to the ray
     best, factor, scores = -np.inf, 1.0, np.zeros((0, 0))
     for tried in _FACTORS:
@@ -142,21 +192,31 @@ def _screened(
         values = values + 2 * prior.low * len(joints) * np.log(tried)
         if values.max() > best:
             best, factor, scores = values.max(), tried, values
+    return factor, _distinct(np.roll(scores, -turn, axis=1), candidates)
+
+
+def _usual(prior: WindowPrior, candidates: int) -> list[tuple[int, int]]:
+    """Return candidates where nobody is visible: draws continue those of the window before."""
+    return [(k, 0) for k in np.argsort(-prior.log_weights)[:candidates].tolist()]
+
+
+def _distinct(scores: np.ndarray, candidates: int) -> list[tuple[int, int]]:
+    """Return the components and headings of the largest scores, (K, A), that are distinct."""
+    best, A = scores.max(), scores.shape[1]
     chosen: list[tuple[int, int]] = []
     for index in np.argsort(-scores, axis=None).tolist():
         k, yaw = divmod(index, A)
         if len(chosen) == candidates or scores[k, yaw] < best - _SCREENED:
             break
-        yaw = (yaw - turn) % A
         gaps = [(yaw - other) % A for part, other in chosen if part == k]
         if all(_NEAR < gap < A - _NEAR for gap in gaps):
             chosen.append((k, yaw))
-    return factor, chosen
+    return chosen
 
 
 def _refined(
     prior: WindowPrior,
-    camera: LevelCamera,
+    camera: LevelCamera | LevelCameras,
     seen: Observed,
     path: np.ndarray,
     origin: np.ndarray,
@@ -171,7 +231,8 @@ def _refined(
     outliers, force = np.full(seen.weight.shape, _WIDE**-2), np.zeros(at.shape)
     scales = [1.0]
     visible = seen.weight > 0
-    given, pitch = camera.pitch, 0.0  # pitch: deviation from the given one over its spread
+    pitch = 0.0  # deviation from the given one over its spread
+    given = camera.pitch if isinstance(camera, LevelCamera) else 0.0
     mode, leverage = None, None
     for number in range(_ROUNDS):
         matrix, target = camera.linearised(at, seen.points)
@@ -184,7 +245,7 @@ def _refined(
         for scale in prior.scales.tolist() if number == 1 else scales:
             tried, share = _solved(prior, k, yaw, scale, matrix, target, weight, pose, force, turn)
             positions = tried.positions + origin
-            turned = replace(camera, pitch=given + tilt * tried.pitch)
+            turned = _turned(camera, given + tilt * tried.pitch)
             square = seen.weight * _squares(turned, seen, positions)
             fit = -0.5 * (_FREEDOM + 2) * np.log1p(square[visible] / _FREEDOM).sum()
             score = tried.score + fit + prior.log_weights[k]
@@ -194,24 +255,32 @@ def _refined(
                     score=score,
                     positions=positions,
                     standardised=square,
-                    pitch=turned.pitch,
+                    pitch=given + tilt * tried.pitch,
                 )
                 leverage = share
         mode = best
         assert mode is not None
         assert leverage is not None
         scales, at, pose = [mode.scale], mode.positions, mode.positions
-        camera = replace(camera, pitch=mode.pitch)
+        camera = _turned(camera, mode.pitch)
         pitch = (mode.pitch - given) / tilt if tilt else 0.0
         outliers = (_FREEDOM + 2) / (_FREEDOM + mode.standardised)
-        force = (leverage / camera.depth(at))[..., None] * camera.axes[2]
+        force = camera.along_depth(leverage / camera.depth(at))
     assert mode is not None
     return mode
 
 
-def _squares(camera: LevelCamera, seen: Observed, positions: np.ndarray) -> np.ndarray:
-    """Return squared residuals in units of the noise, (L, J)."""
-    residual = (seen.points - camera.project(positions)) * camera.focal / seen.noise
+def _turned(camera: LevelCamera | LevelCameras, pitch: float) -> LevelCamera | LevelCameras:
+    """Return a camera of another pitch; several cameras are calibrated and unchanged."""
+    return replace(camera, pitch=pitch) if isinstance(camera, LevelCamera) else camera
+
+
+def _squares(
+    camera: LevelCamera | LevelCameras, seen: Observed, positions: np.ndarray
+) -> np.ndarray:
+    """Return squared residuals in units of the noise, (L, J) or (V, L, J)."""
+    focal = np.asarray(camera.focal)[..., None]
+    residual = (seen.points - camera.project(positions)) * focal / seen.noise
     square: np.ndarray = (residual**2).sum(axis=-1)
     return square
 
@@ -228,12 +297,12 @@ def _solved(
     force: np.ndarray,
     turn: np.ndarray,
 ) -> tuple[WindowMode, np.ndarray]:
-    """Return the Gaussian posterior of A X = t with given weights, and leverages, (L, J)."""
+    """Return the Gaussian posterior of A X = t with given weights, and leverages, as weights."""
     gaussian = WindowGaussian(prior, k, yaw, scale)
     part, R, sd = gaussian.part, gaussian.rotation, gaussian.deviation
-    L, J = weight.shape
+    L, J = weight.shape[-2:]
     r, bones = len(sd), J - 1
-    q, n = r + 2 + bones, 2 * L * J
+    q, n = r + 2 + bones, 2 * weight.size
     root = np.sqrt(weight)[..., None]
     turned = (matrix * root[..., None]) @ R
     design, residual = np.zeros((n + L * bones, q)), np.empty(n + L * bones)
@@ -248,7 +317,7 @@ def _solved(
     rows = (along[..., None, :] @ spread)[..., 0, :] * sd
     design[n:, :r] = rows.reshape(L * bones, r) / _BONE_NOISE
     own = np.arange(L * bones)
-    design[n + own, r + 2 + own % bones] = -np.tile(part.bones, L) * _PROPORTIONS / _BONE_NOISE
+    design[n + own, r + 2 + own % bones] = -np.tile(part.bones, L) * PROPORTIONS / _BONE_NOISE
     average = part.mean[:, prior.children] - part.mean[:, prior.parents]
     residual[n:] = (part.bones - (along * average).sum(axis=-1)).ravel() / _BONE_NOISE
     precision = design.T @ design
@@ -259,9 +328,22 @@ def _solved(
     lower = np.linalg.cholesky(precision)
     z = solve_triangular(lower, solve_triangular(lower, pull, lower=True), lower=True, trans=1)
     half = solve_triangular(lower, design[:n].T, lower=True)
-    leverage = np.einsum("qn,qn->n", half, half).reshape(L, J, 2).sum(axis=-1)
+    leverage = np.einsum("qn,qn->n", half, half).reshape(*weight.shape, 2).sum(axis=-1)
     stretch = residual[n:] - design[n:] @ z
     score = -0.5 * (z @ z + stretch @ stretch) - np.log(np.diag(lower)).sum()
     positions = gaussian.positions(prior, k, z[None], np.arange(L))[0]
-    blank = np.empty((0, 0))
-    return WindowMode(float(score), k, yaw, scale, z, lower, positions, blank, z[r + 1]), leverage
+    mean_posture = (part.frequency == 0) & ~part.ground
+    posture = float(scale * (z[:r][mean_posture] ** 2).mean())
+    mode = WindowMode(
+        score=float(score),
+        component=k,
+        yaw=yaw,
+        scale=scale,
+        mean=z,
+        lower=lower,
+        positions=positions,
+        standardised=np.empty((0, 0)),
+        pitch=z[r + 1],
+        posture=posture,
+    )
+    return mode, leverage

@@ -18,6 +18,7 @@ TEMPER, _INFLATION = 0.03, 2.0
 """Power of the modes' probabilities, and factor of standard deviations.
 
 Chosen on validation clips, since motion unlike the clips makes the exact posterior too narrow.
+The factor is multiplied by the root of a mode's ``posture`` if that is above 1.
 """
 _JOIN_NOISE = 0.01  # standard deviation with which draws continue earlier ones, metres
 
@@ -29,8 +30,9 @@ class WindowMode:
     ``score`` is its log posterior mass up to a constant. ``mean``, (q,), and ``lower``, (q, q), are
     the mean and the Cholesky factor of the precision of standardised coefficients: those of the
     component, then the floor's height and the camera's pitch, then the proportions. ``positions``,
-    (L, J, 3), are those of the mean, metres, and ``standardised``, (L, J), squared residuals in
-    units of the noise. ``pitch`` is that of the camera, radians.
+    (L, J, 3), are those of the mean, metres, and ``standardised``, (L, J) or (V, L, J), squared
+    residuals in units of the noise. ``pitch`` is that of the camera, radians. ``posture`` is the
+    mean square of the standardised coefficients of frequency 0: of the mean posture.
     """
 
     score: float
@@ -42,6 +44,12 @@ class WindowMode:
     positions: np.ndarray
     standardised: np.ndarray
     pitch: float
+    posture: float
+
+    @property
+    def inflation(self) -> float:
+        """Factor of the posterior's standard deviations."""
+        return _INFLATION * max(1.0, self.posture) ** 0.5
 
 
 class WindowGaussian:
@@ -123,7 +131,6 @@ class WindowPosterior:
         continue: they are observed to within a centimetre.
         """
         units = rng.standard_normal((n, max(len(mode.mean) for mode in self.modes)))
-        units *= _INFLATION
         chances = rng.random(n)
         slack = _JOIN_NOISE * rng.standard_normal((n, 0 if earlier is None else earlier[0].size))
         log_weights = np.repeat(np.log(self.probabilities)[None], n, axis=0)
@@ -133,7 +140,7 @@ class WindowPosterior:
             for index, mode in enumerate(self.modes):
                 gaussian = self._gaussian(mode)
                 design = gaussian.design(self.prior, joined)
-                half = _INFLATION * solve_triangular(mode.lower, design.T, lower=True)
+                half = mode.inflation * solve_triangular(mode.lower, design.T, lower=True)
                 covariance = half.T @ half + _JOIN_NOISE**2 * np.eye(half.shape[1])
                 factor = np.linalg.cholesky(covariance)
                 centre = gaussian.positions(self.prior, mode.component, mode.mean[None], joined)
@@ -147,7 +154,7 @@ class WindowPosterior:
         for index in np.unique(chosen).tolist():
             mode, rows = self.modes[index], np.flatnonzero(chosen == index)
             gaussian, q = self._gaussian(mode), len(mode.mean)
-            unit = units[rows, :q].T
+            unit = mode.inflation * units[rows, :q].T
             z = mode.mean + solve_triangular(mode.lower, unit, lower=True, trans=1).T
             if corrections and joined is not None:
                 half, factor, target = corrections[index]
@@ -156,7 +163,7 @@ class WindowPosterior:
                 inner = solve_triangular(factor, gap.T, lower=True)
                 inner = solve_triangular(factor, inner, lower=True, trans=1)
                 change = solve_triangular(mode.lower, half @ inner, lower=True, trans=1).T
-                z = z + _INFLATION * change
+                z = z + mode.inflation * change
             out[rows] = gaussian.positions(self.prior, mode.component, z, times) + self.origin
         return out
 

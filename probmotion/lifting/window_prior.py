@@ -12,7 +12,6 @@ from probmotion.models.mixture.spectral_mixture import SpectralMixtureMotion
 
 __all__ = ["ReducedComponent", "WindowPrior"]
 
-_SMALLEST = 0.02  # prior standard deviation of the coefficients that are kept, metres
 _SCREENS = 6  # cameras and sets of joints whose screening is kept
 _LOW = 12  # frequencies by which components are screened
 _SCREEN_NOISE = 0.03  # of the screened keypoints with the neglected perspective, metres
@@ -52,9 +51,6 @@ class ReducedComponent(NamedTuple):
 class WindowPrior:
     """Components of a spectral prior for windows of L frames at a lower frame rate.
 
-    Coefficients whose prior standard deviation is below 2 cm are set to 0: keypoints hardly
-    determine them.
-
     Parameters
     ----------
     prior : SpectralMixtureMotion
@@ -62,11 +58,16 @@ class WindowPrior:
         L.
     fps : float
         Frame rate of the windows.
+    smallest : float
+        Prior standard deviation below which coefficients are set to 0, metres: keypoints of one
+        camera hardly determine those below 2 cm.
     """
 
-    def __init__(self, prior: SpectralMixtureMotion, frames: int, fps: float) -> None:
+    def __init__(
+        self, prior: SpectralMixtureMotion, frames: int, fps: float, smallest: float = 0.02
+    ) -> None:
         self.prior = prior.resampled(frames, fps)
-        self.frames, self.fps = frames, fps
+        self.frames, self.fps, self.smallest = frames, fps, smallest
         self.low = min(_LOW, frames)
         self.log_weights = np.log(prior.weights)
         self.yaws = prior.yaws
@@ -95,7 +96,7 @@ class WindowPrior:
         prior, L = self.prior, self.frames
         J = prior.skeleton.n_joints
         variances = prior.variances[k]
-        kept = np.sqrt(variances) > _SMALLEST
+        kept = np.sqrt(variances) > self.smallest
         kept[0, :2] = True
         frequency, direction = np.nonzero(kept)
         V = prior.directions[k][prior.band[frequency], :, direction]  # (r, 3 J)

@@ -6,9 +6,12 @@ import pytest
 from probmotion.cli.main import main
 from probmotion.data.synthetic.gaits import make_gait
 from probmotion.data.videos import film
+from probmotion.geometry.rotations import matrix_to_vector
+from probmotion.io.conventions import Z_UP_TO_Y_UP
 from probmotion.io.files import load
+from probmotion.motion.skeleton import Skeleton
 
-NAMES = ["lift.bvh", "lift.glb", "lift.html", "lift.npz", "summary.json"]
+NAMES = ["lift.bvh", "lift.glb", "lift.html", "lift.npz", "lift.smpl22.npz", "summary.json"]
 
 
 @pytest.fixture(scope="module")
@@ -62,4 +65,70 @@ def test_errors_are_one_line_and_leave_no_files(fails, detections, tmp_path):
     }
     for options, expected in cases.items():
         assert expected in fails(*base, *options), options
+        assert not any(out.rglob("*.*"))
+
+
+@pytest.fixture(scope="module")
+def trial(tmp_path_factory):
+    """Write a trial of Pose2Sim with two cameras; return its folder and the true positions."""
+    folder = tmp_path_factory.mktemp("trial")
+    clip = make_gait("walk", 3, frames=40)
+    toml = "[metadata]\nerror = 0.0\n"
+    for number, azimuth in ((2, 0.8), (10, 2.4)):
+        video = film(clip, number, azimuth=azimuth)
+        frames = folder / "pose-associated" / f"cam{number}_json"
+        frames.mkdir(parents=True)
+        values = np.nan_to_num(np.dstack([video.track.keypoints, video.track.confidence]))
+        for frame, points in enumerate(values):
+            people = [{"pose_keypoints_2d": points.ravel().tolist()}]
+            path = frames / f"cam{number}.{frame:03d}.json"
+            path.write_text(json.dumps({"people": people}), encoding="utf-8")
+        camera = video.camera
+        (x, y), focal = camera.centre[0], camera.focal[0]
+        vector = matrix_to_vector(camera.rotation[0] @ Z_UP_TO_Y_UP)
+        toml += f"[cam_{number}]\nname = 'cam_{number}'\nsize = {list(video.size)}\n"
+        toml += f"matrix = [[{focal}, 0.0, {x}], [0.0, {focal}, {y}], [0.0, 0.0, 1.0]]\n"
+        toml += f"distortions = [0.0, 0.0, 0.0, 0.0]\nrotation = {vector.tolist()}\n"
+        toml += f"translation = {camera.translation[0].tolist()}\nfisheye = false\n"
+    (folder / "Calib.toml").write_text(toml, encoding="utf-8")
+    return folder, clip.retarget(Skeleton.preset("person14")).positions
+
+
+def test_a_trial_of_calibrated_cameras_is_lifted_in_their_world(capsys, trial, tmp_path):
+    folder, truth = trial
+    words = ["lift", str(folder), "--camera", str(folder / "Calib.toml"), "--fps", "30"]
+    assert main([*words, "--draws", "2", "--out", str(tmp_path)]) == 0
+    assert "the 2 cameras (cam_2, cam_10)" in capsys.readouterr().out
+    assert sorted(path.name for path in tmp_path.iterdir()) == NAMES
+    distance = np.linalg.norm(load(tmp_path / "lift.npz").positions - truth, axis=-1)[:, 2:]
+    assert distance.mean() < 0.04
+    summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
+    assert [camera["name"] for camera in summary["cameras"]] == ["cam_2", "cam_10"]
+    assert "3D motion from 2 cameras" in (tmp_path / "lift.html").read_text(encoding="utf-8")
+
+
+def test_one_of_the_calibrated_cameras_is_found_by_its_name(capsys, trial, tmp_path):
+    folder, truth = trial
+    one = folder / "pose-associated" / "cam10_json"
+    words = ["lift", str(one), "--camera", str(folder / "Calib.toml"), "--fps", "30"]
+    assert main([*words, "--draws", "2", "--out", str(tmp_path)]) == 0
+    assert "the 1 camera (cam_10)" in capsys.readouterr().out
+    distance = np.linalg.norm(load(tmp_path / "lift.npz").positions - truth, axis=-1)[:, 2:]
+    assert distance.mean() < 0.4
+
+
+def test_wrong_cameras_are_named(fails, trial, detections, tmp_path):
+    folder, _ = trial
+    toml, out = folder / "Calib.toml", tmp_path / "out"
+    one = folder / "pose-associated" / "cam2_json"
+    cases = {
+        (detections, "--camera", toml): "must be named after the calibrated cameras cam_2, cam_10",
+        (detections, one, "--camera", toml): "must be of one person, got 2 in",
+        (one, one, *SIZE): "camera must be given for several files, got 2 files",
+        (one,): "image_size must be given without camera",
+        (one, "--camera", one / "cam2.000.json"): "expected TOML",
+        (one, "--camera", toml, "--image-size", "9", "9"): "that of the calibration, 1000 × 1000",
+    }
+    for words, expected in cases.items():
+        assert expected in fails("lift", *words, "--fps", "30", "--out", out), words
         assert not any(out.rglob("*.*"))

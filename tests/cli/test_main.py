@@ -119,7 +119,7 @@ def test_show_describes_presets_and_problems(capsys, tmp_path, monkeypatch):
 def test_list_prints_problems_samplers_presets_and_skeletons(capsys):
     assert main(["list"]) == 0
     listed = capsys.readouterr().out
-    samplers = "exact ancestral3d mas mvpc sds mh nuts ensemble"
+    samplers = "exact ancestral3d mas mvpc sds mh nuts ensemble tempered smc"
     for name in (*samplers.split(), "gait", "gait-monocular", "mas.reference_code", "h36m17"):
         assert f"\n  {name} " in listed
 
@@ -239,6 +239,8 @@ def test_show_and_convert_a_motion(tmp_path, capsys):
     motion = load(target)
     assert (motion.fps, motion.frames) == (15, 20)
     assert motion.skeleton.joint_names == Skeleton.preset("h36m17").joint_names
+    assert main(["convert", path, target, "--skeleton", "smpl22"]) == 0
+    assert load(target).rotations.shape == (40, 22, 3, 3)
 
 
 def test_show_finds_a_network_by_folder_or_name(tmp_path, capsys, monkeypatch, fails):

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from probmotion.io.files import load
+from probmotion.motion.skeleton import Skeleton
 
 
 def test_a_lift_is_saved(lifted, tmp_path):
     lifted.save(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "lift.bvh", "lift.glb", "lift.html", "lift.npz", "summary.json",
+        "lift.bvh", "lift.glb", "lift.html", "lift.npz", "lift.smpl22.npz", "summary.json",
     ]  # fmt: skip
     content = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert content["trusted"] == lifted.trusted
@@ -17,6 +18,11 @@ def test_a_lift_is_saved(lifted, tmp_path):
         assert np.allclose(archive["draws"], lifted.draws)
         assert np.allclose(archive["sd"], lifted.sd)
     assert np.allclose(load(tmp_path / "lift.npz").positions, lifted.mean.positions)
+    smpl = load(tmp_path / "lift.smpl22.npz")
+    assert smpl.skeleton == Skeleton.preset("smpl22")
+    assert smpl.rotations is not None
+    moved = smpl.retarget(lifted.mean.skeleton).positions - lifted.mean.positions
+    assert np.linalg.norm(moved, axis=-1).mean() < 0.015
 
 
 def test_the_page_loads_nothing_and_escapes_names(lifted, tmp_path):

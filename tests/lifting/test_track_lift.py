@@ -72,8 +72,34 @@ def test_taller_people_are_farther_away(video, lifted):
     assert not np.allclose(usual.draws, lifted.draws[:2], rtol=0.01)
 
 
-@pytest.mark.parametrize("kind", ["random", "mirrored", "animal"])
-def test_keypoints_that_no_person_explains_are_flagged(video, kind):
+def test_draws_have_pitches_of_their_own_where_it_is_estimated(video, lifted):
+    pitch = float(np.degrees(lifted.camera.pitch))
+    given = lift(video.track, image_size=video.size, progress=False, draws=40, pitch=pitch)
+
+    def inclination(draws: np.ndarray) -> np.ndarray:
+        trunk = (draws[:, :, 1] - draws[:, :, 0]).mean(axis=1)
+        return np.degrees(np.arctan2(trunk[:, 2], trunk[:, 1]))
+
+    known, estimated = np.std(inclination(given.draws)), np.std(inclination(lifted.draws))
+    assert estimated**2 - known**2 > 2.0**2
+    # The floor stays where it is.
+    heights = lifted.draws[:, :, 0, 1].mean(axis=1)
+    assert np.std(heights) < 1.5 * np.std(given.draws[:, :, 0, 1].mean(axis=1)) + 0.06
+
+
+def test_draws_have_focal_lengths_of_their_own_without_a_field_of_view(video, lifted):
+    given = lift(video.track, image_size=video.size, progress=False, draws=40, fov=60.0)
+    assert np.allclose(about_hips(given.draws), about_hips(lifted.draws))
+    ratio = np.log(lifted.draws[..., 0, 2] / given.draws[..., 0, 2])
+    assert np.allclose(ratio, ratio[:, :1])
+    assert np.std(ratio[:, 0]) == pytest.approx(0.3, rel=0.4)
+
+
+@pytest.mark.parametrize(
+    ("kind", "failed"),
+    [("random", "noise"), ("mirrored", "mirrored"), ("animal", "posture"), ("moving", "unsteady")],
+)
+def test_keypoints_that_no_person_explains_are_flagged(video, kind, failed):
     track = video.track
     if kind == "animal":
         gait = quadruped_as_person(make_gait("quadruped-trot", 1, frames=60))
@@ -85,10 +111,13 @@ def test_keypoints_that_no_person_explains_are_flagged(video, kind):
         )
     if kind == "mirrored":
         points[..., 0] = 1000 - points[..., 0]
+    if kind == "moving":
+        pan = 80 * np.sin(2 * np.pi * 0.6 * np.arange(len(points)) / track.fps)
+        points = np.clip(points + np.stack([pan, pan / 2], axis=-1)[:, None], 0, 999)
     result = lift(
         replace(track, keypoints=points), image_size=(1000, 1000), progress=False, draws=2
     )
-    assert not result.trusted
+    assert failed in [check.name for check in result.checks if not check.passed]
     assert result.summary()[0].startswith("Do not trust")
 
 

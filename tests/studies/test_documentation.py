@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import doctest
+import json
 import re
 import shutil
 import subprocess
@@ -14,6 +15,7 @@ import nbformat
 import pytest
 
 from probmotion.citations import CITATIONS, OF_SETTINGS, POSE_PAIRS
+from probmotion.cli.main import main
 from probmotion.comparison.results.table import BLOCKS
 
 ROOT = Path(__file__).parents[2]
@@ -73,6 +75,14 @@ def test_make_targets_exist():
     contributing = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     for target in set(re.findall(r"make (\w+)", README + contributing)):
         assert re.search(rf"^{target}:", makefile, flags=re.MULTILINE), target
+
+
+def test_the_demo_lifts_the_shipped_keypoints(tmp_path):
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    (words,) = re.findall(r"probmotion (lift .*) --out demo/lift$", makefile, flags=re.MULTILINE)
+    command, file, *options = words.split()
+    assert main([command, str(ROOT / file), *options, "--draws", "4", "--out", str(tmp_path)]) == 0
+    assert json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["trusted"]
 
 
 def test_every_cited_work_is_listed():

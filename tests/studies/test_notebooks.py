@@ -208,3 +208,22 @@ def test_exact_priors(tmp_path, monkeypatch):
     )
     assert seen < smoother
     assert "exact on cmu-motion: right" in printed
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+def test_from_video_to_blender(tmp_path, monkeypatch):
+    printed = run("08_from_video_to_blender.py", tmp_path, 2, monkeypatch)
+    pattern = r"mean error: (\d+) mm; 90 % intervals contain (\d+)%"
+    error, contained = re.search(pattern, printed).groups()
+    assert float(error) < 80
+    assert 70 < float(contained) <= 100
+    assert {path.suffix for path in (tmp_path / "walk").iterdir()} >= {".bvh", ".glb", ".html"}
+    rows = {
+        name: float(re.search(rf"^{name} +([\d.]+)", printed, re.MULTILINE)[1])
+        for name in ("nothing given", "fov 40°", "fov 80°", "height 1.5 m")
+    }
+    # Distances are proportional to the focal length, fov is 60° by default, and to the height.
+    for name, ratio in {"fov 40°": 1.59, "fov 80°": 0.69, "height 1.5 m": 1.5 / 1.7}.items():
+        assert rows[name] / rows["nothing given"] == pytest.approx(ratio, rel=0.1)
+    assert printed.count("Do not trust this motion") == 2

@@ -1,0 +1,110 @@
+"""Calibrations in Pose2Sim's TOML format."""
+
+import numpy as np
+import pytest
+
+from probmotion.io.errors import MotionFileError
+from probmotion.io.keypoints.calibration import read_calibration, view_folders
+
+CAMERA = """
+[cam_{number:02d}]
+name = "cam_{number:02d}"
+size = [1088.0, 1920.0]
+matrix = [[1680.0, 0.0, 530.0], [0.0, 1682.0, 950.0], [0.0, 0.0, 1.0]]
+distortions = [-0.3, 0.1, 0.001, -0.002]
+rotation = [1.2091995761561452, 1.2091995761561452, -1.2091995761561452]
+translation = [0.3, 1.0, 3.0]
+fisheye = false
+"""
+FILE = CAMERA.format(number=1) + CAMERA.format(number=2) + "[metadata]\nadjusted = false\n"
+
+
+@pytest.fixture
+def path(tmp_path):
+    path = tmp_path / "Calib.toml"
+    path.write_text(FILE, encoding="utf-8")
+    return path
+
+
+def test_cameras_are_turned_to_y_up(path):
+    calibration = read_calibration(path)
+    assert calibration.names == ("cam_01", "cam_02")
+    assert calibration.sizes == ((1088, 1920), (1088, 1920))
+    # The rotation maps (x, y, z) of the file to (y, -z, -x) of the camera.
+    x, y, z = 0.4, -0.7, 1.6
+    own = np.array([y + 0.3, 1.0 - z, 3.0 - x])
+    pixel = calibration.cameras.project(np.array([[[x, z, -y]]]))[0, 0, 0]
+    assert np.allclose(pixel, 1681 * own[:2] / own[2] + [530, 950])
+
+
+def test_distortion_is_removed(path):
+    calibration = read_calibration(path)
+    x, y = np.random.default_rng(0).uniform([-0.3, -0.5], [0.3, 0.5], (20, 2)).T
+    square = x**2 + y**2
+    radial = 1 - 0.3 * square + 0.1 * square**2
+    u = x * radial + 0.002 * x * y - 0.002 * (square + 2 * x**2)
+    v = y * radial + 0.001 * (square + 2 * y**2) - 0.004 * x * y
+    seen = np.stack([1680 * u + 530, 1682 * v + 950], axis=-1)
+    pixels = calibration.undistorted(1, seen[None])[0]
+    assert np.allclose(pixels, 1681 * np.stack([x, y], axis=-1) + [530, 950], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("names", "found"),
+    [
+        (["cam_02", "cam_01"], [1, 0]),
+        (["cam02_json"], [1]),
+        (["Cam01.trial", "cam-02"], [0, 1]),
+        (["left", "right"], [0, 1]),
+        (["cam_01", "cam_01"], [0, 1]),
+    ],
+)
+def test_recordings_are_matched_by_name_or_else_by_order(path, names, found):
+    assert read_calibration(path).matched(names) == found
+
+
+def test_names_that_contain_others_are_matched_exactly(path):
+    path.write_text(FILE.replace("cam_02", "cam_010"), encoding="utf-8")
+    assert read_calibration(path).matched(["cam010_json", "cam01_json"]) == [1, 0]
+
+
+def test_other_numbers_without_names_are_refused(path):
+    with pytest.raises(ValueError, match=r"cameras cam_01, cam_02, or be as many .* got left$"):
+        read_calibration(path).matched(["left"])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("[metadata]", "[metadata", "expected TOML"),
+        ("matrix", "K", "expected cameras"),
+        ("cam_02", "cam_01", "expected TOML"),
+        ('name = "cam_02"', 'name = "cam_01"', "different names"),
+        ("fisheye = false", "fisheye = true", "fisheye"),
+        ("[1680.0, 0.0", "[1680.0, 2.0", "focal lengths and principal point only"),
+        ("[0.3, 1.0, 3.0]", "[0.3, 1.0]", "translation must have shape"),
+        ("[0.3, 1.0, 3.0]", '["a", 1.0, 3.0]', "translation must be numbers"),
+        ("[0.3, 1.0, 3.0]", "[nan, 1.0, 3.0]", "translation must be finite"),
+        ("-0.3, 0.1, ", "", "distortions must be 4 or 5"),
+        ("1088.0", "0.0", "size must be pixels"),
+        ("[1680.0, 0.0", "[-1680.0, 0.0", "focal lengths and principal point"),
+    ],
+)
+def test_defects_are_reported(path, old, new, words):
+    path.write_text(FILE.replace(old, new), encoding="utf-8")
+    with pytest.raises(MotionFileError, match=words) as error:
+        read_calibration(path)
+    assert "Calib.toml" in str(error.value)
+
+
+@pytest.mark.parametrize("stage", ["pose", "pose-sync", "pose-associated"])
+def test_a_trial_has_a_folder_of_every_camera(tmp_path, stage):
+    for name in ("cam10_json", "cam2_json", "video"):
+        (tmp_path / stage / name).mkdir(parents=True)
+    for name in ("cam10_json", "cam2_json"):
+        (tmp_path / stage / name / "frame_0.json").write_text("{}", encoding="utf-8")
+    (tmp_path / "pose").mkdir(exist_ok=True)
+    found = view_folders(tmp_path)
+    assert [folder.name for folder in found] == ["cam2_json", "cam10_json"]
+    assert found[0].parent.name == stage
+    assert view_folders(found[0]) == [found[0]]

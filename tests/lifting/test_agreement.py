@@ -1,0 +1,164 @@
+"""Agreement of the Gaussian modes of windows with NUTS on the exact density of each mode."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.linalg import solve_triangular
+
+from probmotion import seeds
+from probmotion.data.synthetic.gaits import make_gait
+from probmotion.data.videos import film
+from probmotion.lifting import window_fit
+from probmotion.lifting.camera import LevelCamera
+from probmotion.lifting.keypoints import (
+    LIMBS,
+    PERSON,
+    averaged,
+    body_path,
+    person_keypoints,
+    smooth_size,
+)
+from probmotion.lifting.window_fit import PROPORTIONS, Observed, lift_window
+from probmotion.lifting.window_posterior import WindowGaussian
+from probmotion.lifting.windows import cut
+
+STYLES = ("walk", "march", "run", *["walk"] * 7)  # of ten windows
+CONVERGED = 12  # rounds of the fit
+WARMUP, DRAWS, CHAINS = 100, 200, 2
+HIPS = [PERSON.joint_names.index(f"{side}_hip") for side in ("left", "right")]
+
+pytestmark = pytest.mark.slow
+
+
+def window(number):
+    """Return the prior, camera, keypoints, and first path of a made video of two seconds."""
+    gait = make_gait(STYLES[number], number, frames=60)
+    height = (1.0, 2.2)[number % 2]
+    video = film(gait, number, azimuth=number * np.pi / 5, height=height)
+    prior, _, step = cut(60, 30.0, 1)
+    keypoints = averaged(person_keypoints(video.track), step)
+    pitch = float(np.arcsin(video.camera.rotation[0, 2, 1]))
+    camera = LevelCamera(video.camera.focal[0], tuple(video.camera.centre[0]), pitch)
+    points, weight, _ = keypoints
+    normalised = np.where(weight[..., None] > 0, camera.normalised(points), 0.0)
+    path = body_path(keypoints)
+    depth = camera.focal / smooth_size(path.size)
+    return prior, camera, Observed(normalised, weight, 4.0), camera.normalised(path.middle), depth
+
+
+def log_density(z, design, offset, camera, seen, prior, bones):
+    """Return the unnormalised log density of one component's standardised coefficients."""
+    positions = (design @ z).reshape(offset.shape) + offset
+    plane, depth = positions @ camera.axes[:2].T, positions @ camera.axes[2]
+    residual = (seen.points - plane / depth[..., None]) * camera.focal / seen.noise
+    square = seen.weight * (residual**2).sum(axis=-1)
+    bone = positions[:, prior.children] - positions[:, prior.parents]
+    lengths = bones * (1 + PROPORTIONS * z[-len(bones) :])
+    stretch = (jnp.linalg.norm(bone, axis=-1) - lengths) / 0.01
+    # Student-t with four degrees of freedom in two dimensions.
+    return -0.5 * z @ z - 3 * jnp.log1p(square / 4).sum() - 0.5 * (stretch**2).sum()
+
+
+def draws_of_nuts(log_density, mode, number):
+    """Return draws, (chains, draws, q); NUTS begins at the mode and is scaled by its precision."""
+    from numpyro.infer import MCMC, NUTS
+
+    scale = solve_triangular(mode.lower.T, np.eye(len(mode.mean)))
+    start = 0.3 * seeds.generator(number, "start").standard_normal((CHAINS, len(mode.mean)))
+    with jax.enable_x64(True):
+        kernel = NUTS(
+            potential_fn=lambda unit: -log_density(mode.mean + jnp.asarray(scale) @ unit),
+            adapt_mass_matrix=False,
+            max_tree_depth=7,
+        )
+        chain = MCMC(
+            kernel,
+            num_warmup=WARMUP,
+            num_samples=DRAWS,
+            num_chains=CHAINS,
+            chain_method="sequential",
+            progress_bar=False,
+        )
+        chain.run(seeds.jax_key(number, "nuts"), init_params=jnp.asarray(start))
+        units = np.asarray(chain.get_samples(group_by_chain=True))
+    return mode.mean + units @ scale.T
+
+
+def about_hips(positions):
+    """Return the limbs' joints relative to the middle of the hips."""
+    return positions[..., LIMBS, :] - positions[..., HIPS, :].mean(axis=-2, keepdims=True)
+
+
+def compared(number):
+    """Compare fits with NUTS.
+
+    Returns differences of means in units of NUTS's standard deviation for the converged fit, the
+    fit as it is, and the converged fit without the force; then the ratio of standard deviations
+    of the converged fit, and R-hat. Each value is a median over frames, joints and axes.
+    """
+    prior, camera, seen, middle, depth = window(number)
+    times = np.arange(prior.frames)
+    fit = partial(lift_window, prior, camera, seen, middle, depth)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(window_fit, "_ROUNDS", CONVERGED)
+        posterior = fit()
+        zeros = np.zeros((*seen.weight.shape, 3))
+        patch.setattr(LevelCamera, "along_depth", lambda camera, sizes: zeros)
+        unforced = fit()
+    mode, usual = posterior.best, fit()
+    gaussian = WindowGaussian(prior, mode.component, mode.yaw, mode.scale)
+    design = gaussian.design(prior, times)
+    zero = np.zeros((1, len(mode.mean)))
+    offset = gaussian.positions(prior, mode.component, zero, times)[0] + posterior.origin
+    bones = gaussian.part.bones
+    exact = partial(
+        log_density,
+        design=design,
+        offset=offset,
+        camera=camera,
+        seen=seen,
+        prior=prior,
+        bones=bones,
+    )
+    z = draws_of_nuts(exact, mode, number)
+    draws = about_hips((z @ design.T).reshape(CHAINS, DRAWS, *offset.shape) + offset)
+    mean, sd = draws.mean(axis=(0, 1)), draws.std(axis=(0, 1))
+    within, between = draws.var(axis=1, ddof=1).mean(axis=0), draws.mean(axis=1).var(axis=0, ddof=1)
+    r_hat = np.sqrt((DRAWS - 1) / DRAWS + between / within)
+
+    differences = []
+    for other in (posterior, usual, unforced):
+        same = [m for m in other.modes if (m.component, m.yaw) == (mode.component, mode.yaw)]
+        differences.append(np.median(np.abs(about_hips(same[0].positions) - mean) / sd))
+    columns = about_hips(design.T.reshape(-1, *offset.shape)).reshape(len(mode.mean), -1)
+    half = solve_triangular(mode.lower, columns, lower=True)
+    spread = np.sqrt((half**2).sum(axis=0)).reshape(sd.shape)
+    return *differences, np.median(spread / sd), np.median(r_hat)
+
+
+@pytest.fixture(scope="module")
+def figures():
+    """Return the comparisons of all windows, (10, 5), and print them."""
+    rows = []
+    for number in range(len(STYLES)):
+        rows.append(compared(number))
+        print(number, *(f"{value:.3f}" for value in rows[-1]), flush=True)
+    return np.array(rows)
+
+
+def test_means_agree_with_nuts(figures):
+    assert np.median(figures[:, 4]) < 1.05
+    assert np.median(figures[:, 0]) < 0.2
+
+
+def test_the_force_is_needed(figures):
+    converged, _, unforced = np.median(figures[:, :3], axis=0)
+    assert unforced > 1.5 * converged
+
+
+def test_spreads_agree_with_nuts(figures):
+    # Weights that are taken as known make the Gaussian narrower, by up to √.75.
+    assert 0.75**0.5 - 0.03 < np.median(figures[:, 3]) < 1
