@@ -62,8 +62,8 @@ def test_wheel_contains_every_module_and_nothing_else(wheel):
     weights = [
         "joint_limits.npz", "walk2d.md", "walk2d.safetensors", "walk2d-evaluator.safetensors",
         "walk2d-features.npz", "body-dvae.md", "body-dvae.safetensors",
-        "body-dvae-denoiser.safetensors", "cmu-motion.md", "cmu-motion.npz", "salsa-pairs.md",
-        "salsa-pairs.npz",
+        "body-dvae-denoiser.safetensors", "cmu-motion.md", "cmu-motion.npz",
+        "cmu-motion-coco17.md", "cmu-motion-coco17.npz", "salsa-pairs.md", "salsa-pairs.npz",
     ]  # fmt: skip
     weights += [
         f"{name}{ending}"

@@ -17,6 +17,7 @@ from probmotion.validation import check_count, check_positive, check_shape
 
 __all__ = ["DenoisedJoints", "denoise_joints"]
 
+_SHIPPED = {"person14": "cmu-motion", "coco17": "cmu-motion-coco17"}
 _SECONDS = 2.0  # length of a window
 _OVERLAP = 2  # frames of a window's draw on which the next window is conditioned
 _JOIN_NOISE = 1e-3  # standard deviation of these frames, metres
@@ -91,7 +92,7 @@ def denoise_joints(
     progress : bool
         Show a progress bar.
     prior : SpectralMixtureMotion, optional
-        By default the shipped ``cmu-motion`` of the skeleton.
+        By default ``cmu-motion`` for ``person14`` and ``cmu-motion-coco17`` for ``coco17``.
 
     Raises
     ------
@@ -218,11 +219,12 @@ class _Recording:
 @lru_cache(maxsize=4)
 def _shipped(skeleton: Skeleton, frames: int, fps: float) -> SpectralMixtureMotion:
     """Return the shipped prior of a skeleton for windows; cached per process."""
-    if skeleton == Skeleton.preset("person14"):
-        return SpectralMixtureMotion.load("cmu-motion").resampled(frames, fps)
+    for preset, name in _SHIPPED.items():
+        if skeleton == Skeleton.preset(preset):
+            return SpectralMixtureMotion.load(name).resampled(frames, fps)
     raise ValueError(
-        f"skeleton must be person14, got one of {skeleton.n_joints} joints; retarget the "
-        "recording, or give a prior fitted to clips of this skeleton"
+        f"skeleton must be {' or '.join(_SHIPPED)}, got one of {skeleton.n_joints} joints; "
+        "retarget the recording, or give a prior fitted to clips of this skeleton"
     )
 
 

@@ -419,6 +419,9 @@ class SpectralMixtureMotion:
     def load(cls, source: str | Path = "cmu-motion") -> SpectralMixtureMotion:
         """Read a shipped prior by name, or a file written by :meth:`save`.
 
+        ``cmu-motion`` is on ``person14``. ``cmu-motion-coco17`` is on ``coco17``, with face points
+        that were assumed, not recorded (:mod:`probmotion.data.face_points`).
+
         Raises
         ------
         FileNotFoundError

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -53,16 +53,24 @@ excluded: ``humanoid3d_walk`` and ``humanoid3d_zombie_walk`` are excerpts of oth
 _STYLES = tuple(style for style, gait in GAITS.items() if gait.body == "person")
 
 
-def denoising_clips(folder: str | Path) -> dict[str, list[Motion]]:
-    """Return the recorded clips of each part on ``person14`` at 30 frames per second.
+def denoising_clips(
+    folder: str | Path, convert: Callable[[Motion], Motion] | None = None
+) -> dict[str, list[Motion]]:
+    """Return the recorded clips of each part at 30 frames per second.
 
-    ``folder`` contains the clips of :data:`DENOISING_CLIPS` as ``.npz``. A clip is split at frames
+    ``folder`` contains the clips of :data:`DENOISING_CLIPS` as ``.npz``. ``convert`` converts
+    recordings to the skeleton of the clips, by default ``person14``. A clip is split at frames
     marked as ``suspect`` in its file (marker jumps) into segments named ``cmu_01_07-0``, …. Raises
     ``FileNotFoundError`` if a file is missing, and ``ValueError`` if ``suspect`` is not one bool
     per frame.
     """
+    convert = _on_person if convert is None else convert
     return {
-        part: [segment for name in names for segment in _segments(Path(folder) / f"{name}.npz")]
+        part: [
+            segment
+            for name in names
+            for segment in _segments(Path(folder) / f"{name}.npz", convert)
+        ]
         for part, names in DENOISING_CLIPS.items()
     }
 
@@ -89,9 +97,13 @@ def synthetic_denoising_clips(
     return {"train": clips[:n], "validation": clips[n:end], "test": clips[end:]}
 
 
-def _segments(path: Path) -> list[Motion]:
+def _on_person(motion: Motion) -> Motion:
+    return motion.retarget(Skeleton.preset("person14"))
+
+
+def _segments(path: Path, convert: Callable[[Motion], Motion]) -> list[Motion]:
     """Return the segments between suspect frames that are at least a window long."""
-    motion = load(path).retarget(Skeleton.preset("person14"))
+    motion = convert(load(path))
     with np.load(path) as archive:
         suspect = archive["suspect"] if "suspect" in archive else np.zeros(motion.frames, bool)
     if suspect.dtype != bool or suspect.shape != (motion.frames,):

@@ -9,6 +9,7 @@ from probmotion.data.denoising_clips import (
     denoising_clips,
     synthetic_denoising_clips,
 )
+from probmotion.data.face_points import with_face_points
 from probmotion.io.files import load
 from probmotion.motion.distances import windows, yaw_aligned_distances
 
@@ -94,6 +95,9 @@ def test_segments_between_suspect_frames(tmp_path, monkeypatch):
     assert (first.name, second.name) == ("clip-0", "clip-1")
     np.testing.assert_array_equal(first.positions, synthetic.positions[1:40])
     np.testing.assert_array_equal(second.positions, synthetic.positions[61:])
+    faces = denoising_clips(tmp_path, with_face_points)["train"]
+    assert [(face.name, face.frames) for face in faces] == [("clip-0", 39), ("clip-1", 59)]
+    assert {face.skeleton for face in faces} == {Skeleton.preset("coco17")}
     write(np.zeros(3, bool))
     with pytest.raises(ValueError, match=r"suspect must be bool of shape \(120,\)"):
         denoising_clips(tmp_path)

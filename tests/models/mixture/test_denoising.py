@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from probmotion.data.joint_filters import kalman_smooth
+from probmotion.data.synthetic.gaits import make_gait
 from probmotion.data.synthetic.walks import synthetic_walks
 from probmotion.models.mixture.denoising import denoise_joints
 from probmotion.models.mixture.spectral_mixture import SpectralMixtureMotion
@@ -96,6 +97,23 @@ def test_long_gaps_and_lone_frames():
     assert one.mean.shape == (1, 14, 3)
 
 
+def test_face_is_uncertain_if_only_limbs_are_observed():
+    coco = Skeleton.preset("coco17")
+    walk = make_gait("walk", frames=20, fps=10.0).retarget(coco.subset(range(5, 17))).positions
+    joints = np.full((20, 17, 3), np.nan)
+    joints[:, 5:] = walk + 0.02 * np.random.default_rng(0).normal(size=walk.shape)
+    options = {"skeleton": coco, "fps": 10.0, "noise": 0.02, "draws": 0, "progress": False}
+    found = denoise_joints(joints, **options)
+    assert (found.sd[:, :5].mean(axis=(1, 2)) > 2 * found.sd[:, 5:].mean(axis=(1, 2))).all()
+    error = np.linalg.norm(found.mean[:, 5:] - walk, axis=-1)
+    assert error.mean() < 0.02 * np.sqrt(3)
+    # The nose is in front of the ears, where the walk leads, and above the shoulders.
+    ears = found.mean[:, 3:5].mean(axis=1)
+    travel = (walk[-1] - walk[0]).mean(axis=0) * [1.0, 0.0, 1.0]
+    assert ((found.mean[:, 0] - ears) @ travel / np.linalg.norm(travel) > 0.08).all()
+    assert (ears[:, 1] > walk[:, :2, 1].max(axis=1) + 0.1).all()
+
+
 def test_invalid_input():
     joints, _ = noisy()
     with pytest.raises(ValueError, match="joints must contain an observed joint, got none"):
@@ -103,5 +121,5 @@ def test_invalid_input():
     with pytest.raises(ValueError, match="noise"):
         denoise_joints(joints, noise=-1.0, **OPTIONS)
     other = Skeleton(["a", "b"], [-1, 0])
-    with pytest.raises(ValueError, match="skeleton must be person14"):
+    with pytest.raises(ValueError, match="skeleton must be person14 or coco17"):
         denoise_joints(joints[:, :2], skeleton=other, fps=30.0, progress=False)

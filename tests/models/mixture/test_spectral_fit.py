@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from probmotion import Motion, Skeleton
+from probmotion.data.face_points import FACE_POINTS
 from probmotion.data.synthetic.gaits import make_gaits
 from probmotion.data.synthetic.walks import synthetic_walks
 from probmotion.models.mixture import SpectralMixtureMotion, spectral_fit
@@ -178,10 +179,29 @@ def test_held_out_density_is_that_of_the_prior():
     np.testing.assert_allclose(density, one.log_prior(windows), rtol=1e-9)
 
 
-def test_shipped_prior_of_all_clips_is_symmetric():
+@pytest.mark.parametrize("name", ["cmu-motion", "cmu-motion-coco17"])
+def test_shipped_prior_of_all_clips_is_symmetric(name):
     """It is fitted to clips and their mirror images; the first component is that of all windows."""
-    prior = SpectralMixtureMotion.load("cmu-motion")
+    prior = SpectralMixtureMotion.load(name)
     order = list(prior.skeleton.mirrored_order)
     images = prior.poses[:, order] * [-1.0, 1.0, 1.0]
     np.testing.assert_allclose(images[0], prior.poses[0], atol=1e-6)
     assert abs(prior.velocities[0, 0]) < 1e-6
+
+
+def test_faces_of_the_shipped_prior_are_in_front():
+    """Mean poses face +Z, and random turns of the head are as often to the left as to the right."""
+    prior = SpectralMixtureMotion.load("cmu-motion-coco17").resampled(20, 10.0)
+    assert prior.skeleton == Skeleton.preset("coco17")
+    draws = prior.sample(np.random.default_rng(0), 8)
+    assert np.isfinite(prior.log_prior(draws)).all()
+    points = {name: prior.poses[:, prior.skeleton.index(name)] for name in FACE_POINTS}
+    ears = (points["left_ear"] + points["right_ear"]) / 2
+    for name, place in FACE_POINTS.items():
+        # The mean of rotated vectors is shorter than they are.
+        assert (np.linalg.norm(points[name] - ears, axis=1) < np.linalg.norm(place) + 1e-6).all()
+    ahead = prior.weights @ (points["nose"] - ears)
+    assert ahead[2] > 0.06  # half of the distance, as heads are bent
+    assert abs(ahead[0]) < 0.01
+    left = prior.weights @ (points["left_ear"] - points["right_ear"])
+    assert left[0] > 0.1
