@@ -1,17 +1,37 @@
-"""Atomic file writes and checks of output folders."""
+"""Atomic file writes, checks of output folders, and safe reading of archives and JSON."""
 
 from __future__ import annotations
 
+import io
+import json
 import os
 import platform
 import re
+import sys
 import tempfile
+import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-__all__ = ["forget_killed", "writable_folder", "written_whole"]
+if TYPE_CHECKING:
+    import numpy as np
+
+__all__ = [
+    "forget_killed",
+    "member_array",
+    "open_archive",
+    "read_arrays",
+    "read_json",
+    "writable_folder",
+    "written_whole",
+]
+
+# An archive may unpack to this number of bytes, or to this multiple of its own size. Recorded
+# numbers compress to a tenth at most, zeros to a thousandth.
+_UNPACKED_BYTES, _UNPACKED_RATIO = 2**26, 100
 
 
 def _machine() -> str:
@@ -88,3 +108,91 @@ def writable_folder(folder: Path) -> Path:
         reason = error.strerror or str(error)
         raise OSError(f"out must be a writable folder, got {str(folder)!r}: {reason}") from error
     return folder
+
+
+def open_archive(content: bytes) -> zipfile.ZipFile:
+    """Return an ``.npz`` archive that unpacks to a plausible size.
+
+    Raises
+    ------
+    ValueError
+        If the content is no zip archive, or unpacks to more than 64 MiB and 100 times its size.
+    """
+    try:
+        archive = zipfile.ZipFile(io.BytesIO(content))
+    except Exception as error:  # damaged zip files raise many types, including MemoryError
+        raise ValueError(f"expected an npz archive ({str(error)[:80]})") from error
+    unpacked = sum(member.file_size for member in archive.infolist())
+    most = max(_UNPACKED_BYTES, _UNPACKED_RATIO * len(content))
+    if unpacked > most:
+        raise ValueError(f"expected an npz archive of at most {most} bytes, got {unpacked}")
+    return archive
+
+
+def member_array(archive: zipfile.ZipFile, key: str) -> np.ndarray:
+    """Return an array of an ``.npz`` archive; pickled objects are refused.
+
+    Raises
+    ------
+    KeyError
+        If there is no such array.
+    ValueError
+        If it is damaged or has objects.
+    """
+    import numpy as np
+
+    name = f"{key}.npy"
+    if name not in archive.namelist():
+        raise KeyError(key)
+    try:
+        array = np.lib.format.read_array(io.BytesIO(archive.read(name)), allow_pickle=False)
+    except Exception as error:  # as in open_archive; pickled objects raise ValueError
+        raise ValueError(
+            f"expected numbers or strings in {key[:40]} ({str(error)[:80]})"
+        ) from error
+    # Arrays without bytes may have any shape.
+    if array.dtype.names is not None or not array.dtype.itemsize:
+        raise ValueError(f"expected numbers or strings in {key[:40]}, got {array.dtype!s:.80}")
+    if array.dtype.kind == "U" and not _is_text(array):
+        raise ValueError(f"expected Unicode in {key[:40]}, got invalid characters")
+    return array
+
+
+def _is_text(array: np.ndarray) -> bool:
+    """Return whether all characters exist; NumPy does not check them."""
+    import numpy as np
+
+    codes = np.frombuffer(array.tobytes(), np.dtype("u4").newbyteorder(array.dtype.byteorder))
+    surrogate = (codes >= 0xD800) & (codes < 0xE000)
+    return bool((codes <= sys.maxunicode).all() and not surrogate.any())
+
+
+def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
+    """Return all arrays of an ``.npz`` archive by key; see :func:`open_archive`.
+
+    Raises
+    ------
+    ValueError
+        If the file is no such archive, or is damaged.
+    OSError
+        If the file cannot be opened.
+    """
+    with open_archive(Path(path).read_bytes()) as archive:
+        names = [name for name in archive.namelist() if name.endswith(".npy")]
+        return {key: member_array(archive, key) for key in (n.removesuffix(".npy") for n in names)}
+
+
+def read_json(path: str | Path) -> Any:
+    """Return the content of a JSON file.
+
+    Raises
+    ------
+    ValueError
+        If the file is not JSON in UTF-8.
+    OSError
+        If the file cannot be opened.
+    """
+    try:
+        return json.loads(Path(path).read_bytes())
+    except RecursionError as error:
+        raise ValueError("expected JSON that is not nested deeply") from error

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import fields
 from difflib import get_close_matches
 from importlib import import_module
-from typing import Any
+from types import NoneType, UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -16,6 +18,7 @@ __all__ = [
     "check_finite",
     "check_positive",
     "check_shape",
+    "check_types",
     "did_you_mean",
     "import_extra",
 ]
@@ -68,6 +71,38 @@ def check_count(name: str, value: int, least: int = 1) -> None:
     """Raise ``ValueError`` unless ``value`` is an integer of at least ``least``."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise ValueError(f"{name} must be an integer of at least {least}, got {value!r}")
+
+
+def check_types(value: Any) -> None:
+    """Raise ``ValueError`` unless the fields of a dataclass have the annotated types.
+
+    For dataclasses that are read from files. Annotations may be classes, ``Any``, unions, and
+    dictionaries, lists and tuples of them; integers are accepted as ``float``.
+    """
+    kinds = get_type_hints(type(value))
+    for entry in fields(value):
+        given = getattr(value, entry.name)
+        if not _fits(given, kinds[entry.name]):
+            expected = str(entry.type)
+            raise ValueError(f"{entry.name} must be {expected}, got {given!r:.80}")
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    """Return whether a JSON value has the type of an annotation."""
+    origin, parts = get_origin(kind), get_args(kind)
+    if kind is Any:
+        return True
+    if origin in (Union, UnionType):
+        return any(_fits(value, part) for part in parts)
+    if origin is dict:
+        return isinstance(value, dict) and all(
+            _fits(key, parts[0]) and _fits(entry, parts[1]) for key, entry in value.items()
+        )
+    if origin in (list, tuple):
+        return isinstance(value, origin) and all(_fits(entry, parts[0]) for entry in value)
+    if kind is float:
+        return isinstance(value, int | float)
+    return isinstance(value, NoneType if kind is None else kind)
 
 
 def import_extra(module: str, extra: str) -> Any:

@@ -177,7 +177,7 @@ def test_test_folders_mirror_the_packages() -> None:
     packages = {package.removeprefix("probmotion/") for package in packages}
     tests = ROOT / "tests"
     folders = {path.parent.relative_to(tests).as_posix() for path in tests.rglob("test_*.py")}
-    assert folders - {".", "studies"} <= packages
+    assert folders - {".", "fuzz", "studies"} <= packages
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 import math
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -23,7 +22,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from probmotion.arrays import Array, array_namespace, constant
-from probmotion.files import written_whole
+from probmotion.files import read_arrays, written_whole
 from probmotion.geometry.cameras import Cameras
 from probmotion.models.mixture.conditioned_spectra import ConditionedSpectra
 from probmotion.models.mixture.conditioning import Component, Components
@@ -438,15 +437,15 @@ class SpectralMixtureMotion:
                 f"source must be a file or one of {shipped}, got {str(source)!r}"
             )
         try:
-            with np.load(path, allow_pickle=False) as archive:
-                header = json.loads(str(archive["header"]))
-                arrays = {name: archive[name] for name in (*_ROUNDED, *_EXACT)}
-                arrays |= {name: arrays[name].astype(np.float64) for name in _ROUNDED}
+            archive = read_arrays(path)
+            header = json.loads(str(archive["header"]))
+            arrays = {name: archive[name] for name in (*_ROUNDED, *_EXACT)}
+            arrays |= {name: arrays[name].astype(np.float64) for name in _ROUNDED}
             if header["format"] != _FORMAT:
                 raise ValueError(f"format {header['format']}")
             skeleton = Skeleton(**header["skeleton"])
             numbers = {name: header[name] for name in ("fps", "ground", "azimuths", "card")}
-        except (KeyError, ValueError, OSError, zipfile.BadZipFile) as error:
+        except (KeyError, TypeError, ValueError, OSError, RecursionError) as error:
             raise ValueError(
                 f"source must be a file written by SpectralMixtureMotion.save, got {path.name} "
                 f"({error})"

@@ -110,7 +110,7 @@ def load_checkpoint(source: str | Path, kind: str) -> Checkpoint:
             text = (file.metadata() or {}).get(_ENTRY)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         header = None if text is None else json.loads(text)
-    except (SafetensorError, json.JSONDecodeError, OSError, UnicodeDecodeError) as error:
+    except (SafetensorError, ValueError, RecursionError, OSError) as error:
         raise CheckpointError(f"{path} is damaged or not a safetensors file: {error}") from error
     if not isinstance(header, dict) or "format" not in header:
         raise CheckpointError(f"{path} must be a checkpoint of probmotion, got no header")
@@ -134,7 +134,7 @@ def valid_settings(source: str | Path, network: str) -> Iterator[None]:
     """Convert errors due to missing or invalid settings of a network to ``CheckpointError``."""
     try:
         yield
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, OverflowError, TypeError, ValueError) as error:
         raise CheckpointError(
             f"{source} must contain valid {network} settings, got an error: {error}"
         ) from error

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from probmotion.arrays import logsumexp
-from probmotion.files import written_whole
+from probmotion.files import read_arrays, written_whole
 from probmotion.interaction.annotations.annotations import Annotations
 from probmotion.interaction.annotations.sources import ELEVATIONS, world_axes
 from probmotion.models.unseen_depth.em import Poses, expectation, maximisation
@@ -294,11 +294,10 @@ class AnnotationPrior:
     def load(cls, path: str | Path) -> AnnotationPrior:
         """Read an archive written by :meth:`save`."""
         try:
-            with np.load(path, allow_pickle=False) as archive:
-                arrays = dict(archive)
+            arrays = read_arrays(path)
             noise = float(arrays.pop("noise"))
             return cls(noise=noise, **arrays)
-        except (KeyError, TypeError, ValueError, EOFError) as error:
+        except (KeyError, TypeError, ValueError) as error:
             raise ValueError(
                 f"{path} must be an archive written by AnnotationPrior.save, got an unreadable file"
             ) from error

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +13,9 @@ import numpy as np
 
 from probmotion.calibration.error_measures import MEASURES
 from probmotion.comparison.results.fingerprint import fingerprint
-from probmotion.files import written_whole
+from probmotion.files import read_json, written_whole
 from probmotion.metrics.intervals import t_interval
+from probmotion.validation import check_types
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -113,6 +115,14 @@ class ErrorDecomposition:
             self.table().to_csv(unfinished, index=False)
 
 
+@dataclass(frozen=True)
+class _StoredFile:
+    """Content of ``decompose_error.json``."""
+
+    question: str
+    values: dict[str, dict[str, float]]
+
+
 class StoredValues:
     """Stored measures of each sampler and seed, saved as JSON in ``folder`` unless it is None.
 
@@ -127,12 +137,23 @@ class StoredValues:
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)
         if self.path.exists():
-            stored = json.loads(self.path.read_text(encoding="utf-8"))
-            if stored["question"] != self.question:
+            stored = self._read()
+            if stored.question != self.question:
                 raise ValueError(
                     f"out must be a new folder, got {str(folder)!r} with another decomposition"
                 )
-            self._values = stored["values"]
+            self._values = stored.values
+
+    def _read(self) -> _StoredFile:
+        assert self.path is not None
+        try:
+            stored = _StoredFile(**read_json(self.path))
+            check_types(stored)
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"{self.path} is damaged: {str(error)[:200]}; delete it to restart"
+            ) from error
+        return stored
 
     def get(self, name: str, seed: int) -> dict[str, float] | None:
         """Return the measures of a sampler and seed, or None if they are not stored."""

@@ -174,12 +174,12 @@ def object_from_text(text: str, kinds: Iterable[type]) -> Any:
     known = {kind.__name__: kind for kind in kinds}
     try:
         built = _build(ast.parse(text.strip(), mode="eval").body, known)
-    except SyntaxError:
+    except (SyntaxError, MemoryError, RecursionError):
         built = None
     if type(built) not in known.values():
         raise ValueError(
             f"setting must be one of {', '.join(known)}, with options such as Name(option=1), got "
-            f"{text!r}"
+            f"{text[:80]!r}"
         )
     return built
 
@@ -187,9 +187,14 @@ def object_from_text(text: str, kinds: Iterable[type]) -> Any:
 def _build(tree: ast.expr, known: dict[str, type]) -> Any:
     name = tree.func if isinstance(tree, ast.Call) else tree
     if not isinstance(name, ast.Name):
-        return ast.literal_eval(tree)
+        try:
+            return ast.literal_eval(tree)
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"options must be numbers, strings or settings, got {ast.unparse(tree)[:80]!r}"
+            ) from error
     if name.id not in known:
-        raise ValueError(f"setting must be one of {', '.join(known)}, got {name.id!r}")
+        raise ValueError(f"setting must be one of {', '.join(known)}, got {name.id[:80]!r}")
     kind: Any = known[name.id]
     if not isinstance(tree, ast.Call):
         return kind()
@@ -197,12 +202,14 @@ def _build(tree: ast.expr, known: dict[str, type]) -> Any:
     for keyword in tree.keywords:
         if keyword.arg not in settings:
             raise ValueError(
-                f"options of {name.id} must be among {', '.join(settings)}, got {keyword.arg!r}"
+                f"options of {name.id} must be among {', '.join(settings)}, got {keyword.arg!r:.80}"
             )
-    return kind(
-        *(_build(value, known) for value in tree.args),
-        **{str(keyword.arg): _build(keyword.value, known) for keyword in tree.keywords},
-    )
+    given = [_build(value, known) for value in tree.args]
+    options = {str(keyword.arg): _build(keyword.value, known) for keyword in tree.keywords}
+    try:
+        return kind(*given, **options)
+    except TypeError as error:
+        raise ValueError(f"options of {name.id} must be valid values, got {error}") from error
 
 
 def text_of_object(value: Any) -> str:

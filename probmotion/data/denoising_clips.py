@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from probmotion.data.synthetic.gaits import GAITS, make_gait
+from probmotion.files import read_arrays
 from probmotion.io.files import load
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
@@ -104,8 +105,7 @@ def _on_person(motion: Motion) -> Motion:
 def _segments(path: Path, convert: Callable[[Motion], Motion]) -> list[Motion]:
     """Return the segments between suspect frames that are at least a window long."""
     motion = convert(load(path))
-    with np.load(path) as archive:
-        suspect = archive["suspect"] if "suspect" in archive else np.zeros(motion.frames, bool)
+    suspect = read_arrays(path).get("suspect", np.zeros(motion.frames, bool))
     if suspect.dtype != bool or suspect.shape != (motion.frames,):
         raise ValueError(
             f"{path.name}: suspect must be bool of shape ({motion.frames},), got {suspect.dtype} "

@@ -9,9 +9,9 @@ from __future__ import annotations
 import csv
 import os
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from probmotion.data.pairs import load_pairs, read_salsa_bvh
 from probmotion.motion.motion import Motion
@@ -48,10 +48,15 @@ _ADDRESS = "https://raw.githubusercontent.com"
 _FOLDER_VARIABLE = "PROBMOTION_DATA"
 _REGISTRY = Path(__file__).with_name("registry.csv")
 _TIMEOUT = 30.0  # seconds without a response
+_CHUNK = 2**16  # bytes
 
 
 class DownloadError(OSError):
-    """Error for a failed download or a wrong SHA-256; the message contains the URL of the file."""
+    """Error for a failed download, a wrong size or SHA-256; the message contains the file's URL."""
+
+
+class _TooLarge(Exception):  # noqa: N818
+    """Raised when a download exceeds its size."""
 
 
 class _Entry(NamedTuple):  # row of registry.csv
@@ -118,7 +123,7 @@ def download(
     ValueError
         If the data set or a name is unknown.
     DownloadError
-        If a file cannot be downloaded or written, or its SHA-256 is wrong.
+        If a file cannot be downloaded or written, is too large, or its SHA-256 is wrong.
     """
     entries = _chosen(dataset, names)
     target = (data_folder() if folder is None else Path(folder)) / dataset
@@ -191,19 +196,20 @@ def _fetch(entry: _Entry, folder: Path, base: str, progress: bool) -> Path:
     import requests
 
     url = f"{base}/{entry.repository}/{entry.commit}/{entry.path}"
+    download_one = partial(_write_response, size=int(entry.bytes), progress=progress)
     try:
         pooch.retrieve(
-            url,
-            known_hash=entry.sha256,
-            fname=entry.name,
-            path=folder,
-            downloader=pooch.HTTPDownloader(progressbar=progress, timeout=_TIMEOUT),
+            url, known_hash=entry.sha256, fname=entry.name, path=folder, downloader=download_one
         )
+    except _TooLarge as error:
+        raise DownloadError(
+            f"{entry.name} at {url} is larger than the {entry.bytes} bytes of the registry; the "
+            "file was discarded"
+        ) from error
     except requests.RequestException as error:
         reason: int | str = type(error).__name__
-        if error.response is not None:  # pooch does not close it
+        if error.response is not None:
             reason = error.response.status_code
-            error.response.close()
         raise DownloadError(
             f"{entry.name} cannot be downloaded from {url} ({reason}); check the network, pass "
             f"base_url= of a mirror, or put the file into {folder}"
@@ -219,3 +225,26 @@ def _fetch(entry: _Entry, folder: Path, base: str, progress: bool) -> Path:
             f"({error.strerror or type(error).__name__}); choose a writable folder"
         ) from error
     return folder / entry.name
+
+
+def _write_response(url: str, path: str, caller: Any, *, size: int, progress: bool) -> None:
+    """Write the response of a server to a file; raise if it has more than ``size`` bytes.
+
+    ``caller`` is an argument of pooch.
+    """
+    import requests
+    from tqdm import tqdm
+
+    with (
+        requests.get(url, stream=True, timeout=_TIMEOUT) as response,
+        open(path, "wb") as file,
+        tqdm(total=size, unit="B", unit_scale=True, disable=not progress) as bar,
+    ):
+        response.raise_for_status()
+        left = size
+        for chunk in response.iter_content(_CHUNK):
+            left -= len(chunk)
+            if left < 0:
+                raise _TooLarge
+            file.write(chunk)
+            bar.update(len(chunk))

@@ -23,16 +23,14 @@ for V ``camera_names``; ``fps``, ``joint_names`` and ``parents``. Other keys are
 
 from __future__ import annotations
 
-import io
 import warnings
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 
-from probmotion.files import written_whole
+from probmotion.files import member_array, open_archive, written_whole
 from probmotion.io.conventions import Z_UP_TO_Y_UP, y_up
 from probmotion.io.errors import (
     LARGEST,
@@ -167,25 +165,20 @@ class Archive:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        content = read_bytes(path)
-        try:
-            self.zip = zipfile.ZipFile(io.BytesIO(content))
-            self.keys = [name.removesuffix(".npy") for name in self.zip.namelist()]
-        except Exception as error:  # damaged zip files raise many types, including MemoryError
-            raise MotionFileError(f"{path}: expected an npz archive ({str(error)[:80]})") from error
+        with errors_in(path):
+            self.zip = open_archive(read_bytes(path))
+        self.keys = [name.removesuffix(".npy") for name in self.zip.namelist()]
 
     def fail(self, problem: str, cause: Exception | None = None) -> NoReturn:
         raise MotionFileError(f"{self.path}: {problem}") from cause
 
     def array(self, key: str) -> np.ndarray:
-        if key not in self.keys:
-            present = ", ".join(name[:40] for name in self.keys[:12]) or "none"
-            self.fail(f"expected the key {key}, got {present}")
         try:
-            member = io.BytesIO(self.zip.read(f"{key}.npy"))
-            return np.lib.format.read_array(member, allow_pickle=False)
-        except Exception as error:  # as in __init__; pickled object arrays raise ValueError
-            self.fail(f"expected numbers or strings in {key} ({str(error)[:80]})", error)
+            with errors_in(self.path):
+                return member_array(self.zip, key)
+        except KeyError as error:
+            present = ", ".join(name[:40] for name in self.keys[:12]) or "none"
+            self.fail(f"expected the key {key}, got {present}", error)
 
     def numbers(self, key: str) -> np.ndarray:
         """Return an array as float64; NaN is accepted, magnitudes above 1e9 are not."""

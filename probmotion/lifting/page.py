@@ -11,7 +11,12 @@ from probmotion.comparison.results.stored_problems import StoredProblem
 from probmotion.geometry.cameras import Cameras
 from probmotion.lifting.checks import Check
 from probmotion.motion.motion import Motion
-from probmotion.plots.animation import animation_html, animation_script, animation_style
+from probmotion.plots.animation import (
+    CONTENT_POLICY,
+    animation_html,
+    animation_script,
+    animation_style,
+)
 from probmotion.plots.motion_data import Shown
 
 __all__ = ["lift_page"]
@@ -74,14 +79,12 @@ def lift_page(
     summary = "".join(f"<p>{escape(sentence)}</p>" for sentence in sentences)
     count = "one camera" if cameras.n_views == 1 else f"{cameras.n_views} cameras"
     title = escape(f"{name}: 3D motion from {count}")
-    # The policy blocks external resources.
-    policy = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
     return f"""\
 <!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy" content="{policy}">
+{CONTENT_POLICY}
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{title}</title>
 <style>{animation_style()}{_STYLE}</style>

@@ -23,8 +23,16 @@ from probmotion.plots.style import LEFT, RIGHT
 from probmotion.validation import check_positive
 
 __all__ = [
-    "Animation", "animate_skeletons", "animation_html", "animation_script", "animation_style",
+    "CONTENT_POLICY", "Animation", "animate_skeletons", "animation_html", "animation_script",
+    "animation_style",
 ]  # fmt: skip
+
+CONTENT_POLICY = (
+    '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; img-src data:; '
+    "style-src 'unsafe-inline'; script-src 'unsafe-inline'; base-uri 'none'; "
+    "form-action 'none'\">"
+)
+"""HTML element of every page: nothing is loaded from the network, and no form is sent."""
 
 # Width of the cell of a motion and minimum width of the page, pixels.
 _PLACE, _CONTROLS = 180, 420
@@ -106,7 +114,10 @@ def animate_skeletons(
     page = f"""\
 <!DOCTYPE html>
 <html lang="en">
-<head><meta charset="utf-8"><title>{html.escape(title or "Animated skeletons")}</title>
+<head>
+<meta charset="utf-8">
+{CONTENT_POLICY}
+<title>{html.escape(title or "Animated skeletons")}</title>
 <style>
 {animation_style()}h1 {{ font-size: 1.1rem; margin: 0; }}
 .cards {{ grid-template-columns: 1fr; }}

@@ -21,6 +21,7 @@ from probmotion.plots.style import (
     plain_axes,
     sampler_style,
     title_axes,
+    without_formulas,
 )  # fmt: skip
 
 if TYPE_CHECKING:
@@ -93,6 +94,7 @@ def plot_quality_against_cost(
     if verdicts is not None:
         figure.supxlabel("filled: verdict right; open: other verdicts", size=SIZE, color=INK)
     # Label positions depend on the layout.
+    without_formulas(figure)
     figure.draw_without_rendering()
     for panel, problem in zip(panels, problems, strict=True):
         _label_points(panel, points[problem])
@@ -156,8 +158,9 @@ def _label_points(axes: Axes, points: Mapping[str, Point]) -> None:
     texts, sizes = {}, {}
     for name in markers:
         text = axes.text(
-            0, 0, name, size=SMALL, color=sampler_style(name).colour, ha="center", va="center"
-        )
+            0, 0, name, size=SMALL, color=sampler_style(name).colour, ha="center", va="center",
+            parse_math=False,
+        )  # fmt: skip
         text.set_path_effects([withStroke(linewidth=2, foreground="white")])
         extent = text.get_window_extent()
         texts[name], sizes[name] = text, (extent.width, extent.height)

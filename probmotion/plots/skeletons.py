@@ -257,5 +257,6 @@ def write_key(figure: Figure, title: str, entries: Mapping[str, str]) -> None:
     right = 1 - 0.08 / width
     for words, colour in reversed(list(entries.items())):
         text = figure.text(right, top, words, ha="right", va="top", size=SIZE, color=colour)
+        text.set_parse_math(False)
         text.set_fontweight("bold")
         right -= (text.get_window_extent().width / figure.dpi + 0.14) / width

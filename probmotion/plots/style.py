@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 __all__ = [
     "COLUMN", "CYCLE", "GREY", "INK", "LEFT", "MARKERS", "PAGE", "RIGHT", "SIZE", "SMALL", "TITLE",
     "SamplerStyle", "check_columns", "finish_figure", "legend_below", "log_axis", "paper_panels",
-    "plain_axes", "sampler_style", "style_of", "title_axes",
+    "plain_axes", "sampler_style", "style_of", "title_axes", "without_formulas",
 ]  # fmt: skip
 
 LEFT = "#0072B2"  # left limbs
@@ -65,6 +65,8 @@ _SAMPLERS = {
     "mh": SamplerStyle("#3F244F", "<"),
     "nuts": SamplerStyle("#0747E3", "s"),
     "ensemble": SamplerStyle("#C08901", "P"),
+    "tempered": SamplerStyle("#60A060", "*"),
+    "smc": SamplerStyle("#000060", "d"),
     "dvae": SamplerStyle("#146E55", "^"),
 }
 
@@ -174,11 +176,21 @@ def legend_below(figure: Figure, ncols: int, axes: Axes | None = None, **options
     return figure.legend(loc="outside lower center", frameon=False, labelcolor=INK, **options)
 
 
+def without_formulas(figure: Figure) -> None:
+    """Draw dollar signs of all texts so far as dollar signs."""
+    from matplotlib.text import Text
+
+    for text in figure.findobj(Text):
+        if "$" in text.get_text():
+            text.set_parse_math(False)
+
+
 def finish_figure(figure: Figure, path: str | Path | None) -> Figure:
     """Save a figure as PNG, PDF or SVG if a path is given, and return it.
 
-    Equal figures give equal files. PDF files contain TrueType fonts; in SVG files, text is
-    drawn as paths, so that it looks the same without the fonts. No file is written on failure.
+    Names are drawn as they are: dollar signs do not make them formulas. Equal figures give equal
+    files. PDF files contain TrueType fonts; in SVG files, text is drawn as paths, so that it looks
+    the same without the fonts. No file is written on failure.
 
     Raises
     ------
@@ -187,6 +199,7 @@ def finish_figure(figure: Figure, path: str | Path | None) -> Figure:
     OSError
         If the folder cannot be written to.
     """
+    without_formulas(figure)
     if path is None:
         return figure
     from matplotlib import rc_context

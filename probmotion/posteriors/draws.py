@@ -18,7 +18,7 @@ from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.arviz_groups import observation_groups, posterior_groups
 from probmotion.posteriors.protocols import Likelihood
-from probmotion.validation import check_finite, check_shape
+from probmotion.validation import check_count, check_finite, check_positive, check_shape
 
 if TYPE_CHECKING:
     from probmotion.posteriors.posterior import MotionPosterior
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["MotionDraws", "library_versions", "settings_of"]
 
 _VERSION = 1  # of the file format
+_DIMS: tuple[str, ...] = ("chain", "draw", "frame", "joint", "axis")  # of positions
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +95,7 @@ class MotionDraws:
         )
         check_finite("positions", positions)
         shape = positions.shape[:2]
-        axes: tuple[str, ...] = ("chain", "draw", "frame", "joint", "axis")
+        axes = _DIMS
         data = {"positions": (axes, positions)}
         if theta is not None:
             check_shape("theta", theta, (*shape, posterior.dim))
@@ -257,8 +258,27 @@ class MotionDraws:
         got = dataset.attrs.get("format_version")
         if got != _VERSION:
             raise ValueError(f"{path} must have format version {_VERSION}, got {got}")
-        counts = [name for name in dataset.attrs if str(name).startswith("evaluations_")]
-        return cls(dataset.assign_attrs({n: int(dataset.attrs[n]) for n in ["seed", *counts]}))
+        try:
+            counts = [name for name in dataset.attrs if str(name).startswith("evaluations_")]
+            draws = cls(dataset.assign_attrs({n: int(dataset.attrs[n]) for n in ["seed", *counts]}))
+            draws._check()
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            raise ValueError(f"{path} must be a valid file of draws: {str(error)[:200]}") from error
+        return draws
+
+    def _check(self) -> None:
+        """Raise an error unless the variables and attributes of a file are complete and valid."""
+        dims, skeleton = self.positions.dims, self.skeleton
+        if dims != _DIMS:
+            raise ValueError(f"positions must have the dimensions {', '.join(_DIMS)}, got {dims}")
+        check_shape("positions", self.positions, ("c", "d", "L", skeleton.n_joints, 3))
+        check_count("number of draws", self.positions.size)
+        check_finite("positions", self.positions.values)
+        check_positive("fps", self.fps)
+        for name in ("sampler", "settings", "seconds", "independent"):
+            kind = str if name in ("sampler", "settings") else int | float | np.number
+            if not isinstance(self.dataset.attrs[name], kind):
+                raise TypeError(f"{name} must be one value")
 
 
 def _with_prefix(prefix: str, entries: Mapping[Any, Any]) -> dict[str, Any]:

@@ -13,12 +13,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
-from zipfile import BadZipFile
 
 import numpy as np
 
 from probmotion import seeds
 from probmotion.arrays import Array, to_numpy
+from probmotion.files import read_arrays, read_json
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.protocols import HasLogDensity
 from probmotion.posteriors.truncation import TruncatedPosterior
@@ -63,6 +63,15 @@ class StoredReference:
         missing = [name for name in _NEEDED if name not in self.certificate]
         if missing:
             raise ValueError(f"certificate must have {', '.join(_NEEDED)}, got none of {missing}")
+        fingerprint = self.certificate["fingerprint"]
+        if not isinstance(fingerprint, list) or not all(
+            isinstance(number, int | float) for number in fingerprint
+        ):
+            raise ValueError(f"fingerprint must be a list of numbers, got {fingerprint!r:.80}")
+        for name, kind in (("sampler", str), ("rhat", int | float | None)):
+            if not isinstance(self.certificate.get(name), kind):
+                value = self.certificate.get(name)
+                raise ValueError(f"{name} of the certificate is invalid: {value!r:.80}")
         if self.certificate["draws"] != self.n:
             raise ValueError(
                 f"certificate must be of the {self.n} stored draws, got {self.certificate['draws']}"
@@ -124,13 +133,11 @@ class StoredReference:
         """Read a reference written by :meth:`save`; raise ``ValueError`` if a file is invalid."""
         folder = Path(folder)
         try:
-            certificate = json.loads((folder / _CERTIFICATE).read_text(encoding="utf-8"))
-            with np.load(folder / _DRAWS, allow_pickle=False) as arrays:
-                positions = arrays["positions"]
-            return cls(positions, dict(certificate))
-        except (ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
+            certificate = read_json(folder / _CERTIFICATE)
+            return cls(read_arrays(folder / _DRAWS)["positions"], dict(certificate))
+        except (ValueError, KeyError, TypeError) as error:
             files = f"{_DRAWS} and {_CERTIFICATE} of probmotion reference"
-            raise ValueError(f"{folder} must contain {files} ({error})") from error
+            raise ValueError(f"{folder} must contain {files} ({str(error)[:200]})") from error
 
 
 def fingerprint_of(posterior: MotionPosterior, positions: np.ndarray) -> list[float]:

@@ -98,16 +98,15 @@ def _resolve(name: str, scale: dict[str, Any]) -> tuple[str, Scale]:
         name, scale = scaled["name"], _parse(scaled["scale"]) | scale
     if name not in problem_names():
         known = problem_names()
-        raise ValueError(
-            f"problem must be one of {', '.join(known)}, got {name!r}{did_you_mean(name, known)}"
-        )
+        similar = did_you_mean(name, known)
+        raise ValueError(f"problem must be one of {', '.join(known)}, got {name[:80]!r}{similar}")
     defaults = _GAITS[name].defaults if name in _GAITS else {}
     for key, value in scale.items():
         if key not in defaults:
             allowed = f"be one of {', '.join(defaults)}" if defaults else "not be set"
-            raise ValueError(f"parameters of {name} must {allowed}, got {key!r}")
+            raise ValueError(f"parameters of {name} must {allowed}, got {key[:80]!r}")
         if not isinstance(value, Hashable):
-            raise ValueError(f"{key} must be a number such as {defaults[key]!r}, got {value!r}")
+            raise ValueError(f"{key} must be a number such as {defaults[key]!r}, got {value!r:.80}")
     changed = {key for key, value in scale.items() if value != defaults[key]}
     return name, tuple((key, scale[key]) for key in defaults if key in changed)
 
@@ -118,9 +117,11 @@ def _parse(text: str) -> dict[str, Any]:
         assert isinstance(call, ast.Call)
         assert not call.args
         return {str(item.arg): ast.literal_eval(item.value) for item in call.keywords}
-    except (SyntaxError, ValueError, AssertionError) as error:
+    except (
+        AssertionError, MemoryError, RecursionError, SyntaxError, TypeError, ValueError
+    ) as error:  # fmt: skip
         raise ValueError(
-            f"parameters must be given as in (frames=20, noise=0.05), got ({text})"
+            f"parameters must be given as in (frames=20, noise=0.05), got ({text[:80]})"
         ) from error
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from probmotion import models, seeds
+from probmotion.files import read_arrays
 from probmotion.metrics.generation import GenerationReference
 from probmotion.motion.motion import Motion
 from probmotion.posteriors.posterior import MotionPosterior
@@ -40,9 +41,9 @@ def learnt_problem(name: str, description: str, kind: str) -> Problem:
 
     weights = Path(models.__file__).parent / "weights"
     evaluator = TrackEvaluator.load(f"{name}-evaluator")
-    with np.load(weights / f"{name}-features.npz") as features:
-        held_out, learnt = (features[part].astype(np.float64) for part in ("held_out", "learnt"))
-        elevation, distance = float(features["elevation"]), float(features["distance"])
+    features = read_arrays(weights / f"{name}-features.npz")
+    held_out, learnt = (features[part].astype(np.float64) for part in ("held_out", "learnt"))
+    elevation, distance = float(features["elevation"]), float(features["distance"])
     reference = GenerationReference(evaluator, held_out, learnt, elevation, distance)
     prior: MotionDiffusion | MotionVAE = getattr(models, kind).load(name)
     problem = Problem(name, description, MotionPosterior(prior), generation=reference)

@@ -20,7 +20,7 @@ from probmotion.comparison.results.headline_metrics import headline_metric
 from probmotion.comparison.results.table import ComparisonTable
 from probmotion.files import written_whole
 from probmotion.metrics.verdict import Verdict
-from probmotion.plots.animation import animation_script, animation_style
+from probmotion.plots.animation import CONTENT_POLICY, animation_script, animation_style
 from probmotion.plots.motion_data import Shown
 from probmotion.plots.quality import plot_quality_against_cost, quality_points
 from probmotion.report.animations import BUDGET, animation, featured_problem, shown_problems
@@ -89,15 +89,12 @@ def _page(comparison: GridResults, calibration: Calibration | None) -> str:
     if calibration is not None:
         sections.append(_calibration(calibration, ranks))
     title = escape(heading(comparison))
-    # The policy blocks external resources.
-    policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; "
-    policy += "script-src 'unsafe-inline'"
     return f"""\
 <!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy" content="{policy}">
+{CONTENT_POLICY}
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{title}</title>
 <style>

@@ -118,7 +118,8 @@ def test_registered_problems_and_budgets_give_identical_results_in_a_worker(caps
 
 def test_notes_name_the_source_of_long_run_references(tmp_path):
     names = ("gait", "gait-noisy3d")
-    plan = Plan.of({name: name for name in names}, {}, draws=8, chains=2, seeds=1)
+    problems = {name: name for name in names}
+    plan = Plan.of(problems, {"walking": Walking()}, draws=8, chains=2, seeds=1)
     assert [re.sub(r"1\.00\d", "1.00", note) for note in plan.references] == [
         "reference draws of gait-noisy3d are 960 draws from long runs of outlier-gibbs (R-hat 1.00)"
     ]

@@ -3,6 +3,8 @@
 import csv
 import hashlib
 import threading
+import zlib
+from contextlib import suppress
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 
@@ -17,14 +19,27 @@ COMMIT = "0" * 40
 
 
 class Handler(SimpleHTTPRequestHandler):
-    """Serve a folder and record requests; truncate responses if ``broken``."""
+    """Serve a folder and record requests; truncate responses if ``broken``.
+
+    If ``endless``, send zeros, gzipped to a thousandth, until the client has enough.
+    """
 
     requests: list[str]
     broken: bool
+    endless: bool
 
     def do_GET(self):
         self.requests.append(self.path)
-        if type(self).broken:
+        if type(self).endless:
+            self.send_response(200)
+            self.send_header("Content-Encoding", "gzip")
+            self.end_headers()
+            zeros = zlib.compressobj(9, wbits=31)
+            with suppress(ConnectionError):
+                for _ in range(10_000):
+                    self.wfile.write(zeros.compress(bytes(2**20)))
+            self.close_connection = True
+        elif type(self).broken:
             self.send_response(200)
             self.send_header("Content-Length", "1000")
             self.end_headers()
@@ -42,7 +57,7 @@ def server(tmp_path):
     """Server of ``tmp_path/served`` with attributes ``url`` and ``handler``."""
     served = tmp_path / "served"
     served.mkdir()
-    handler = type("OwnHandler", (Handler,), {"requests": [], "broken": False})
+    handler = type("OwnHandler", (Handler,), {"requests": [], "broken": False, "endless": False})
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(handler, directory=served)) as running:
         thread = threading.Thread(target=running.serve_forever, args=(0.01,))
         thread.start()
@@ -102,8 +117,13 @@ def test_failed_download_leaves_no_file(server, registry, tmp_path):
     server.handler.broken = False
     (path,) = download("sample", ["a.bvh"], tmp_path / "other", base_url=server.url)
     assert path == tmp_path / "other" / "sample" / "a.bvh"
-    served.write_bytes(b"something else")
+    served.write_bytes(b"something")
     assert_fails(tmp_path, "does not have the SHA-256 .* of the registry", server.url)
+    served.write_bytes(b"something else")
+    assert_fails(tmp_path, "is larger than the 9 bytes of the registry", server.url)
+    server.handler.endless = True
+    assert_fails(tmp_path, "is larger than the 9 bytes of the registry", server.url)
+    server.handler.endless = False
     served.unlink()
     assert_fails(tmp_path, r"\(404\); check the network", server.url)
     assert_fails(tmp_path, r"\(ConnectionError\); check the network", "http://127.0.0.1:9")

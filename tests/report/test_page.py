@@ -35,7 +35,7 @@ from probmotion.report.animations import (
     shown_problems,
 )
 from probmotion.report.page import write_report
-from probmotion.samplers import ScoreDistillation
+from probmotion.samplers import ExactSampler, ScoreDistillation
 
 SAMPLERS = {"good": 1.25, "b<i>ad": 5.5, "none": None}
 
@@ -179,7 +179,8 @@ def test_first_screen_names_command_date_machine_and_budget(tmp_path):
 )  # fmt: skip
 def test_the_command_of_a_comparison_is_stored_with_it(argv, command, tmp_path, monkeypatch):
     monkeypatch.setattr("sys.argv", argv)
-    Plan.of({"generation": generation_problem()}, {}, draws=8, chains=2, seeds=1).save(tmp_path)
+    problems, samplers = {"generation": generation_problem()}, {"exact": ExactSampler()}
+    Plan.of(problems, samplers, draws=8, chains=2, seeds=1).save(tmp_path)
     monkeypatch.setattr("sys.argv", ["probmotion", "report", "folder"])
     assert Plan.load(tmp_path).command == command
     assert Plan.load(tmp_path).date == date.today().isoformat()

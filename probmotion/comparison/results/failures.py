@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import traceback
 from dataclasses import dataclass
+from typing import Any
 
 from probmotion.posteriors.sampling import UnsupportedPosterior
+from probmotion.validation import check_types
 
-__all__ = ["Failure", "NonFiniteDraws", "ResultNotWritten", "TimeLimitExceeded", "WorkerDied"]
+__all__ = [
+    "Failure", "NonFiniteDraws", "ResultNotWritten", "TimeLimitExceeded", "WorkerDied",
+    "read_failure",
+]  # fmt: skip
 
 # Class names and messages of out-of-memory errors other than MemoryError.
 _MEMORY_KINDS = ("OutOfMemoryError",)
@@ -75,6 +80,13 @@ class Failure:
         trace = "".join(traceback.format_exception(error))
         unsupported = isinstance(error, UnsupportedPosterior)
         return cls(_word(error, message), message, unsupported, trace)
+
+
+def read_failure(stored: dict[str, Any]) -> Failure:
+    """Return the failure of a JSON object; raise ``ValueError`` or ``TypeError`` if invalid."""
+    failure = Failure(**stored)
+    check_types(failure)
+    return failure
 
 
 def _word(error: BaseException, message: str) -> str:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
+from probmotion.comparison.results.folder_names import check_name
 from probmotion.posteriors.draws import MotionDraws
 from probmotion.posteriors.finished import FinishedDraws
 from probmotion.posteriors.posterior import MotionPosterior
@@ -17,10 +17,6 @@ from probmotion.posteriors.sampling import Sampler, default_sampler, importable_
 from probmotion.problems.catalogue import load_problem, problem_names
 
 __all__ = ["AnyProblem", "AnySampler", "named_problems", "named_samplers"]
-
-_NAME = re.compile(r"\w[\w.,=+() -]*")
-# Maximum length of a folder name in bytes, without the affixes of temporary names.
-_LONGEST = 200
 
 AnyProblem = str | Problem | MotionPosterior
 AnySampler = Any
@@ -109,12 +105,5 @@ def _add(argument: str, named: dict[str, Any], name: str, value: Any) -> None:
             f"{argument} must have different names, got {name!r} twice; pass a mapping, such as "
             f"{{'{name}-a': …, '{name}-b': …}}"
         )
-    if not _NAME.fullmatch(name):
-        raise ValueError(
-            f"names of {argument} must consist of letters, digits and . , = + ( ) - _, got {name!r}"
-        )
-    if (length := len(name.encode())) > _LONGEST:
-        raise ValueError(
-            f"names of {argument} must have at most {_LONGEST} bytes, got {length}: {name[:20]}…"
-        )
+    check_name(argument, name)
     named[name] = value

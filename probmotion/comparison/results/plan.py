@@ -15,12 +15,14 @@ from typing import Any
 
 from probmotion.comparison.results.budgets import Budget, effort_of
 from probmotion.comparison.results.fingerprint import fingerprint
+from probmotion.comparison.results.folder_names import check_name
 from probmotion.comparison.results.run_results import read_result
-from probmotion.files import written_whole
+from probmotion.files import read_json, written_whole
 from probmotion.posteriors.draws import library_versions
 from probmotion.posteriors.problem import Problem
 from probmotion.posteriors.sampling import Sampler
 from probmotion.problems.catalogue import load_problem
+from probmotion.validation import check_count, check_types
 
 __all__ = ["Plan"]
 
@@ -29,6 +31,7 @@ _PLAN = "comparison.json"
 # format 2 plans without fingerprints.
 _FORMAT = 3
 _COMMAND_SEPARATOR = " && "
+_MAX_RUNS = 10**7  # of plans in files
 
 
 @dataclass(frozen=True)
@@ -189,6 +192,21 @@ class Plan:
         """Return the folder of a run."""
         return folder / "runs" / problem / sampler / str(seed)
 
+    def _check(self) -> None:
+        """Raise ``ValueError`` unless a plan from a file is valid; names are folder names."""
+        check_types(self)
+        for name in ("draws", "chains", "seeds"):
+            check_count(name, getattr(self, name))
+        for kind, names in (("problem", self.problems), ("sampler", self.samplers)):
+            check_count(f"number of {kind}s", len(names))
+            for name in names:
+                check_name(f"{kind}s", name)
+            if names.keys() != self.fingerprints[kind].keys():
+                raise ValueError(f"fingerprints must be of every {kind}")
+        runs = len(self.problems) * len(self.samplers) * self.seeds
+        if runs > _MAX_RUNS:
+            raise ValueError(f"runs must be at most {_MAX_RUNS}, got {runs}")
+
     def save(self, folder: Path) -> None:
         """Write the plan into ``folder``."""
         with written_whole(folder / _PLAN) as unfinished:
@@ -206,17 +224,19 @@ class Plan:
         """
         path = folder / _PLAN
         try:
-            stored = json.loads(path.read_text(encoding="utf-8"))
+            stored = read_json(path)
             version = stored.pop("format", 1)
             if version == _FORMAT:
                 sequences = {name: tuple(stored[name]) for name in ("untuned", "references")}
-                return cls(**stored | sequences)
+                plan = cls(**stored | sequences)
+                plan._check()
+                return plan
         except OSError as error:
             raise ValueError(
                 f"folder must be written by compare(), got {str(folder)!r} without {_PLAN}"
             ) from error
         except (AttributeError, ValueError, TypeError, KeyError) as error:
-            raise ValueError(f"{path} is damaged: {error}") from error
+            raise ValueError(f"{path} is damaged: {str(error)[:200]}") from error
         raise ValueError(
             f"out must be written by this version of probmotion (format {_FORMAT}), got "
             f"{folder} of format {version}; use another folder"

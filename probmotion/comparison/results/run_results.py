@@ -2,20 +2,35 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from probmotion.comparison.results.failures import Failure
-from probmotion.posteriors.draws import MotionDraws
+import numpy as np
 
-__all__ = ["DRAWS", "RESULT", "RunResult", "read_draws", "read_result", "used_of_budget"]
+from probmotion.comparison.results.failures import Failure, read_failure
+from probmotion.files import read_json
+from probmotion.metrics.run_statistics import DrawStatistics
+from probmotion.posteriors.draws import MotionDraws
+from probmotion.validation import check_types
+
+__all__ = [
+    "DRAWS",
+    "FARTHEST",
+    "RESULT",
+    "RunResult",
+    "read_draws",
+    "read_result",
+    "used_of_budget",
+]
 
 DRAWS, RESULT = "draws.nc", "run.json"
 """Files in a run's folder."""
+
+FARTHEST = 1e100
+"""Largest coordinate of draws, metres."""
 
 
 @dataclass(frozen=True)
@@ -41,22 +56,61 @@ class RunResult:
 def read_result(folder: Path) -> RunResult | None:
     """Return the result in a run's folder, or None if it is missing or damaged."""
     try:
-        stored = json.loads((folder / RESULT).read_text(encoding="utf-8"))
+        stored = read_json(folder / RESULT)
         failure = stored.pop("failure")
         metrics = {
             name: math.nan if value is None else value
             for name, value in stored.pop("metrics").items()
         }
-        return RunResult(
-            **stored, metrics=metrics, failure=None if failure is None else Failure(**failure)
+        result = RunResult(
+            **stored, metrics=metrics, failure=None if failure is None else read_failure(failure)
         )
-    except (FileNotFoundError, NotADirectoryError, ValueError, KeyError, TypeError):
+        check_types(result)
+        if result.budget is not None:
+            _check_budget(result.budget)
+        if result.statistics is not None:
+            _check_statistics(DrawStatistics(**result.statistics))
+        return result
+    except (FileNotFoundError, NotADirectoryError, AttributeError, ValueError, KeyError, TypeError):
         return None
 
 
+def _check_budget(budget: dict[str, Any]) -> None:
+    """Raise ``ValueError`` or ``KeyError`` unless a stored budget has the keys of a run."""
+    used, settings = budget["used"], budget["settings"]
+    if not isinstance(used, int | float | None) or not isinstance(settings, dict | None):
+        raise ValueError(f"budget must have an amount and settings, got {budget!r:.80}")
+
+
+def _check_statistics(stored: DrawStatistics) -> None:
+    """Raise ``ValueError`` or ``TypeError`` unless stored statistics fit each other."""
+    k, n_modes = len(stored.mean), len(stored.modes)
+    for name, value, shapes in (
+        ("n", stored.n, [()]),
+        ("m", stored.m, [()]),
+        ("mean", stored.mean, [(k,)]),
+        ("spread", stored.spread, [(k, k)]),
+        ("ratios", [*stored.ratios.values()], [(len(stored.ratios), 2)]),
+        ("modes", [*stored.modes.values()], [(n_modes, 2), (0,)]),
+        ("modes_spread", stored.modes_spread, [(n_modes, n_modes), (0,)]),
+        ("classifier", stored.classifier, [(2,), (0,)]),
+        ("distance", stored.distance, [(2,), (0,)]),
+        ("rhat", stored.rhat or 0.0, [()]),
+        ("rhat_by_chance", stored.rhat_by_chance, [()]),
+    ):
+        # NaN is stored as null.
+        if np.array(value, dtype=np.float64).shape not in shapes:
+            raise ValueError(f"{name} must have shape {shapes[0]}, got {value!r:.80}")
+    if not stored.n > 0:
+        raise ValueError(f"n must be above 0, got {stored.n!r:.80}")
+
+
 def read_draws(folder: Path) -> MotionDraws:
-    """Return the draws in a run's folder."""
-    return MotionDraws.load(folder / DRAWS)
+    """Return the draws in a run's folder; raise ``ValueError`` if they are damaged."""
+    draws = MotionDraws.load(folder / DRAWS)
+    if not (np.abs(draws.positions.values) < FARTHEST).all():
+        raise ValueError(f"{folder / DRAWS} is damaged: positions must be below {FARTHEST:g} m")
+    return draws
 
 
 def used_of_budget(results: Iterable[RunResult]) -> list[str]:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
+from typing import Any
 
 import numpy as np
 
-from probmotion.files import written_whole
+from probmotion.files import read_arrays, written_whole
 from probmotion.geometry.cameras import Cameras
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.likelihoods import Joints3D, Keypoints2D
@@ -125,11 +125,10 @@ def read_stored(folder: str | Path) -> StoredProblem | None:
     if not path.exists():
         return None
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+        arrays = read_arrays(path)
         camera = None
         if "camera_rotation" in arrays:
-            numbers = {name: arrays[f"camera_{name}"] for name in _CAMERA}
+            numbers: dict[str, Any] = {name: arrays[f"camera_{name}"] for name in _CAMERA}
             camera = Cameras(**numbers | {"orthographic": bool(numbers["orthographic"])})
         skeleton = Skeleton(arrays["joint_names"].tolist(), arrays["parents"].tolist())
         return StoredProblem(
@@ -139,5 +138,5 @@ def read_stored(folder: str | Path) -> StoredProblem | None:
             camera=camera,
             **{name: arrays[name].astype(np.float64) for name in _ARRAYS if name in arrays},
         )
-    except (OSError, BadZipFile, KeyError, ValueError, EOFError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} is damaged: {str(error)[:200]}") from error

@@ -122,9 +122,12 @@ _LATEX = str.maketrans(
     {character: rf"\{character}" for character in "&%$#_{}"}
     | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
     | {"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", "–": "--"}
-    | {"±": r"$\pm$", "×": r"$\times$", "²": "$^2$"}
+    | {"±": r"$\pm$", "×": r"$\times$", "²": "$^2$", "\n": " "}
 )
-_MARKDOWN = str.maketrans({"|": r"\|", "*": r"\*", "<": "&lt;", "\\": r"\\"})
+_MARKDOWN = str.maketrans(
+    {character: rf"\{character}" for character in "|*[]`\\"}
+    | {"<": "&lt;", "&": "&amp;", "\n": " "}
+)
 
 
 class ComparisonTable(pd.DataFrame):

@@ -18,7 +18,13 @@ import numpy as np
 
 from probmotion import seeds
 from probmotion.comparison.results.failures import Failure, NonFiniteDraws, ResultNotWritten
-from probmotion.comparison.results.run_results import DRAWS, RESULT, RunResult, read_result
+from probmotion.comparison.results.run_results import (
+    DRAWS,
+    FARTHEST,
+    RESULT,
+    RunResult,
+    read_result,
+)
 from probmotion.comparison.run.grid_tasks import GridTask
 from probmotion.comparison.run.memory import watched_memory
 from probmotion.comparison.run.time_limits import time_limit
@@ -31,7 +37,6 @@ from probmotion.threads import one_thread
 __all__ = ["GridRun", "forget_unfinished"]
 
 _UNFINISHED = ".unfinished-"
-_FARTHEST = 1e100  # largest valid coordinate, metres
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -134,10 +139,10 @@ class GridRun(GridTask):
                 f"{self.sampler} must return draws with their run time, got seconds={draws.seconds}"
             )
         # Metrics sum squares of positions, which must not overflow.
-        if bad := int((~(np.abs(draws.positions.values) < _FARTHEST)).sum()):
+        if bad := int((~(np.abs(draws.positions.values) < FARTHEST)).sum()):
             raise NonFiniteDraws(
                 f"{self.sampler} returned {bad} positions that are not finite or beyond "
-                f"{_FARTHEST:g} metres"
+                f"{FARTHEST:g} metres"
             )
         return draws
 

@@ -9,16 +9,17 @@ from pathlib import Path
 
 from probmotion import seeds
 from probmotion.comparison.results.budgets import Budget, affordable
-from probmotion.comparison.results.failures import Failure, ResultNotWritten
+from probmotion.comparison.results.failures import Failure, ResultNotWritten, read_failure
 from probmotion.comparison.results.run_results import RunResult
 from probmotion.comparison.run.time_limits import time_limit
-from probmotion.files import written_whole
+from probmotion.files import read_json, written_whole
 from probmotion.posteriors.draws import MotionDraws
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.problem import Problem
 from probmotion.posteriors.sampling import Sampler
 from probmotion.problems.catalogue import load_problem
 from probmotion.threads import one_thread
+from probmotion.validation import check_types
 
 __all__ = ["GridTask", "Pilot", "PilotResult"]
 
@@ -106,10 +107,16 @@ class Pilot(GridTask):
 
     def result(self) -> PilotResult | None:
         try:
-            stored = json.loads(self.path.read_text(encoding="utf-8"))
+            stored = read_json(self.path)
             failure = stored.pop("failure")
-            return PilotResult(**stored, failure=None if failure is None else Failure(**failure))
-        except (FileNotFoundError, NotADirectoryError, ValueError, KeyError, TypeError):
+            result = PilotResult(
+                **stored, failure=None if failure is None else read_failure(failure)
+            )
+            check_types(result)
+            return result
+        except (
+            FileNotFoundError, NotADirectoryError, AttributeError, ValueError, KeyError, TypeError
+        ):  # fmt: skip
             return None
 
     def fail(self, error: BaseException) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 
 from probmotion.data.synthetic.cycles import repeated_cycle
 from probmotion.data.synthetic.gaits import GAITS, make_gait
+from probmotion.files import read_arrays
 from probmotion.io.files import load
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
@@ -93,8 +94,7 @@ def _dog_clip(path: Path, frames: int) -> Motion:
     if not path.is_file():
         name = f"{path.parent.name}/{path.name}"
         raise FileNotFoundError(f"folder must contain {name}, got none")
-    with np.load(path) as archive:
-        loop = str(archive["loop"]) if "loop" in archive else "none"
+    loop = str(read_arrays(path).get("loop", "none"))
     cycle = load(path)
     if loop != "wrap" or cycle.fps != _FPS:
         raise ValueError(

@@ -5,15 +5,13 @@ Image coordinates are in metres at the scale of the people, with x right and y u
 
 from __future__ import annotations
 
-import io
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from probmotion.files import written_whole
+from probmotion.files import read_arrays, written_whole
 from probmotion.interaction.annotations.local_frames import chest_joints, joint_roots
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_positive, check_shape
@@ -213,12 +211,8 @@ class Annotations:
     @classmethod
     def load(cls, path: str | Path) -> Annotations:
         """Read an archive written by :meth:`save`; raise ``ValueError`` if it is damaged."""
-        from probmotion.io.errors import read_bytes
-
-        content = read_bytes(Path(path))
         try:
-            with np.load(io.BytesIO(content)) as archive:
-                arrays = dict(archive)
+            arrays = read_arrays(path)
             skeleton = Skeleton(
                 arrays["joint_names"].tolist(),
                 arrays["parents"].tolist(),
@@ -235,7 +229,7 @@ class Annotations:
                 sources=arrays["sources"].tolist() if "sources" in arrays else None,
                 dropped=dict(zip(arrays["dropped_reasons"].tolist(), counts, strict=True)),
             )
-        except (ValueError, KeyError, OSError, EOFError, AttributeError, zipfile.BadZipFile) as err:
+        except (ValueError, KeyError, TypeError, AttributeError) as err:
             raise ValueError(
                 f"{path} must be an archive written by Annotations.save, got an unreadable file "
                 f"({str(err)[:120]})"

@@ -302,7 +302,12 @@ def _category_skeleton(content: dict[str, Any], path: Path) -> Skeleton | None:
         try:
             edges = [[joint - 1 for joint in edge] for edge in category.get("skeleton") or []]
             skeletons.append(named_skeleton(names, edges))
-        except (ValueError, TypeError) as error:
+        except TypeError as error:
+            raise MotionFileError(
+                f"{where}: skeleton must have pairs of keypoints, got "
+                f"{shortened(category['skeleton'])}"
+            ) from error
+        except ValueError as error:
             raise MotionFileError(f"{where}: {str(error)[:200]}") from error
         if skeletons[-1] != skeletons[0]:
             raise MotionFileError(f"{where}: expected the keypoints of the previous category")

@@ -131,7 +131,8 @@ def dataset(file: Any, key: str, path: Path) -> Any:
             f"{path}: expected the dataset {key}, got {', '.join(list(file)[:12])}"
         )
     most = min(_MOST_BYTES, _MOST_COMPRESSED * path.stat().st_size)
-    if item.shape is None or item.size * item.dtype.itemsize > most:
+    # Numbers are converted to eight bytes.
+    if item.shape is None or item.size * max(item.dtype.itemsize, 8) > most:
         raise MotionFileError(
             f"{path}: {key} must have at most {most} bytes, got shape {item.shape}"
         )

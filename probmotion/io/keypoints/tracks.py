@@ -226,7 +226,10 @@ def named_skeleton(names: Sequence[str], edges: Sequence[Sequence[float]]) -> Sk
         if preset.canonical_names == rootless.canonical_names:
             return Skeleton(names, preset.parents)
     neighbours: list[list[int]] = [[] for _ in names]
-    for first, second in edges:
+    for edge in edges:
+        if len(edge) != 2 or not all(isinstance(joint, int | float) for joint in edge):
+            raise ValueError(f"skeleton must have pairs of keypoints, got {shortened(edge)}")
+        first, second = edge
         if not {first, second} <= set(range(len(names))):
             raise ValueError(
                 f"skeleton must have edges between keypoints 1 to {len(names)}, got "

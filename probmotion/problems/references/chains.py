@@ -6,11 +6,10 @@ import time
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
-from probmotion.files import written_whole
+from probmotion.files import read_arrays, written_whole
 
 __all__ = ["StoredChain"]
 
@@ -31,11 +30,11 @@ class StoredChain:
         if self.path is None or not self.path.is_file():
             return None
         try:
-            with np.load(self.path, allow_pickle=False) as state:
-                return dict(state)
-        except (ValueError, EOFError, OSError, BadZipFile) as error:
+            return read_arrays(self.path)
+        except (ValueError, OSError) as error:
             raise ValueError(
-                f"{self.path} must contain a stored chain, got {error}; delete it to restart"
+                f"{self.path} must contain a stored chain, got {str(error)[:200]}; "
+                "delete it to restart"
             ) from error
 
     def save(self, state: Callable[[], Mapping[str, np.ndarray]]) -> None:

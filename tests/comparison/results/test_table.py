@@ -173,7 +173,7 @@ def test_markdown_has_the_cells_of_latex():
     assert rows[0] == "| sampler | verdict | seconds | swd ratio | C2ST |"
     assert rows[1] == "| --- | --- | ---: | ---: | ---: |"
     assert rows[2] == "| good_1 | – | 1.00 | **1.017 ± 0.076** | 1.00 |"
-    assert rows[3].startswith("| 50 % & &lt;more> | – |")
+    assert rows[3].startswith("| 50 % &amp; &lt;more> | – |")
     assert rows[4].startswith(r"| bad\|$x^2$ | overconfident ×1.3 |")
     assert len(rows) == 5
 

@@ -1,0 +1,181 @@
+"""Small valid files of every kind that this package writes for itself, with their readers."""
+
+import json
+
+import numpy as np
+from made_reports import WALK, filmed_problem, walk_prior
+
+from probmotion import MotionDraws, MotionPosterior
+from probmotion.calibration.error_result import StoredValues
+from probmotion.comparison.grid import Comparison
+from probmotion.comparison.results.failures import Failure
+from probmotion.comparison.results.plan import Plan
+from probmotion.comparison.results.run_results import RunResult
+from probmotion.comparison.results.stored_problems import read_stored, store_problem
+from probmotion.comparison.run.grid_tasks import Pilot
+from probmotion.interaction.annotations.annotations import Annotations
+from probmotion.models.pose_pairs.joint_limits import JointLimits
+from probmotion.models.training.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
+from probmotion.models.unseen_depth.annotation_prior import AnnotationPrior
+from probmotion.motion.skeleton import Skeleton
+from probmotion.posteriors.reference import StoredReference
+from probmotion.problems.references.chains import StoredChain
+
+LEG = Skeleton(["hip", "knee"], [-1, 0])
+FINGERPRINT = "0" * 16
+STATISTICS = {
+    "digest": "ab", "n": 40.0, "m": 400.0, "mean": [0.1, 0.2], "spread": [[1.0, 0.1], [0.1, 1.0]],
+    "ratios": {"variance": [0.1, 2.0], "leading variance": [0.0, 2.0]},
+    "modes": {"walk": [0.4, 0.5], "run": [0.6, 0.5]}, "modes_spread": [[0.3, -0.3], [-0.3, 0.3]],
+    "classifier": [0.5, 0.1], "distance": [1.1, 0.4], "rhat": 1.0, "rhat_by_chance": 1.1,
+}  # fmt: skip
+
+
+class Named:
+    name = "made"
+
+
+def small_draws():
+    """Return two chains of three draws of a walk."""
+    drawn = WALK.positions + 0.01 * np.random.default_rng(0).normal(
+        size=(2, 3, *WALK.positions.shape)
+    )
+    return MotionDraws.of(
+        MotionPosterior(walk_prior()), Named(), drawn, seed=2**40, seconds=1.0,
+        statistics={"energy": np.ones((2, 3))}, counts={"density": 7}, state={"step": np.ones(2)},
+    )  # fmt: skip
+
+
+def write_comparison(folder):
+    """Write a grid of one problem with a finished and a failed run."""
+    plan = Plan(
+        {"filmed": "a walk"}, {"good": {"step": "2"}, "bad": {}}, draws=6, chains=2, seeds=1,
+        budget="1 second per run", untuned=("bad",), versions={"numpy": "2"}, date="2025-01-01",
+        fingerprints={"problem": {"filmed": "a"}, "sampler": {"good": "b", "bad": "c"}},
+        machine="one", command="probmotion compare",
+    )  # fmt: skip
+    plan.save(folder)
+    budget = {"allowed": "1 second", "settings": {"step": 2}, "used": 1.0}
+    metrics = {"swd_ratio": 1.0, "seconds": 1.0, "rhat": None}
+    failure = Failure("nan", "NaN or infinite", unsupported=False)
+    for run in (
+        RunResult("filmed", "good", 0, FINGERPRINT, metrics, None, budget, 7, STATISTICS),
+        RunResult("filmed", "bad", 0, FINGERPRINT, {}, failure),
+    ):
+        home = plan.run_folder(folder, run.problem, run.sampler, run.seed)
+        home.mkdir(parents=True)
+        stored = vars(run) | {"failure": run.failure and vars(run.failure)}
+        (home / "run.json").write_text(json.dumps(stored))
+    small_draws().save(folder / "runs/filmed/good/0/draws.nc")
+    store_problem(filmed_problem(3), folder / "problems/filmed", draws=2)
+
+
+def write_reference(folder):
+    certificate = {
+        "problem": "toy", "draws": 6, "exact": False, "sampler": "nuts", "settings": {"a": 1},
+        "rhat": 1.001, "ess_bulk": 400.0, "agreement": [1.0], "seed": 0, "fingerprint": [1.0, -2.5],
+    }  # fmt: skip
+    positions = np.random.default_rng(0).normal(size=(6, 3, 2, 3))
+    StoredReference(positions, certificate).save(folder / "toy")
+
+
+def write_annotations(folder):
+    keypoints = np.random.default_rng(0).normal(size=(3, 2, 2))
+    neighbours = np.full((3, 2, 2, 2), np.nan)
+    Annotations(
+        keypoints, np.ones((3, 2), bool), LEG, neighbours, 30.0, views=np.zeros((3, 2)),
+        sources=["a", "b", "c"], dropped={"blurred": 2},
+    ).save(folder / "a.npz")  # fmt: skip
+
+
+def write_prior(folder):
+    covariances = 0.1 * np.stack([np.eye(6)] * 2)
+    means = np.random.default_rng(0).normal(size=(2, 2, 3))
+    means -= means.mean(axis=1, keepdims=True)
+    views = np.array([[0.1, 0.2], [1.0, 0.0]])
+    AnnotationPrior(np.array([0.4, 0.6]), means, covariances, 0.03, views).save(folder / "p.npz")
+
+
+def write_checkpoint(folder):
+    import torch
+
+    settings = {
+        "network": {
+            "joint_names": ["hip", "knee"], "parents": [-1, 0], "size": {"width": 4},
+            "data": {"tracks": 3, "clips": ["walk"]},
+        },
+        "history": [{"loss": 0.1}], "training": {"steps": 9, "batch": 2}, "step": 3, "seconds": 1.0,
+    }  # fmt: skip
+    tensors = {"a": torch.arange(6.0).reshape(2, 3), "b": torch.ones(2, dtype=torch.int64)}
+    save_checkpoint(folder / "model.safetensors", Checkpoint("toy", settings, tensors))
+
+
+def write_chain(folder):
+    np.savez(folder / "chain.npz", state=np.ones(3), rng=np.array(["a", "b"]))
+
+
+def write_values(folder):
+    StoredValues(folder, "what").put("mas", 0, {"bias": 0.5})
+
+
+def write_pilot(folder):
+    stored = {"fingerprint": FINGERPRINT, "settings": {"steps": 3}, "failure": None}
+    (folder / "pilot.json").write_text(json.dumps(stored))
+
+
+def write_stored(folder):
+    store_problem(filmed_problem(3), folder, draws=2)
+
+
+def read_draws(folder):
+    draws = MotionDraws.load(folder / "draws.nc")
+    assert np.isfinite(draws.flat()).all()
+    return draws.motion(0), draws.counts, draws.state, draws.seconds
+
+
+def read_comparison(folder):
+    comparison = Comparison.load(folder)
+    return comparison.summary(), str(comparison.table())
+
+
+def read_report(folder):
+    comparison = Comparison.load(folder)
+    return comparison.report(folder / "report.html")
+
+
+def read_checkpoint(folder):
+    return load_checkpoint(folder / "model.safetensors", "toy")
+
+
+def read_summary(folder):
+    from probmotion.cli.summaries import summarise
+
+    return summarise(folder / "model.safetensors").text
+
+
+def read_pilot(folder):
+    return Pilot(
+        path=folder / "pilot.json", problem="p", sampler="s", source="p", with_sampler=None,
+        draws=1, chains=1, fingerprint="",
+    ).result()  # fmt: skip
+
+
+OWN = {
+    "draws": (lambda folder: small_draws().save(folder / "draws.nc"), read_draws),
+    "comparison": (write_comparison, read_comparison),
+    "report": (write_comparison, read_report),
+    "reference": (write_reference, lambda folder: StoredReference.load(folder / "toy")),
+    "annotations": (write_annotations, lambda folder: Annotations.load(folder / "a.npz")),
+    "annotation prior": (write_prior, lambda folder: AnnotationPrior.load(folder / "p.npz")),
+    "joint limits": (
+        lambda folder: JointLimits.shipped().save(folder / "l.npz"),
+        lambda folder: JointLimits.load(folder / "l.npz"),
+    ),
+    "checkpoint": (write_checkpoint, read_checkpoint),
+    "summary": (write_checkpoint, read_summary),
+    "chain": (write_chain, lambda folder: StoredChain(folder / "chain.npz").load()),
+    "decomposition": (write_values, lambda folder: StoredValues(folder, "what")),
+    "pilot": (write_pilot, read_pilot),
+    "stored problem": (write_stored, read_stored),
+}
+"""Functions that write into a folder and read it, by kind."""
