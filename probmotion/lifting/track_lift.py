@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -104,20 +105,23 @@ def lift_track(
     """
     windows = _windows(keypoints, fps)
     with one_thread(), progress_bar(len(windows.starts), "lift", progress) as bar:
-        estimate = _estimated(windows, camera, noise or guess, pitch)
-        other = _estimated(windows.mirrored(), camera, noise or guess, pitch)
-        camera, level = replace(camera, pitch=estimate.pitch), noise or estimate.noise
+        with ThreadPoolExecutor(2) as pool:
+            estimate, other = pool.map(
+                lambda each: _estimated(each, camera, noise or guess, pitch),
+                (windows, windows.mirrored()),
+            )
+        level, found = noise or estimate.noise, replace(camera, pitch=estimate.pitch)
         posteriors = fitted(
-            lambda start: windows.posterior(start, camera, level), windows.starts, bar.update
+            lambda start: windows.posterior(start, found, level), windows.starts, bar.update
         )
         frames = len(keypoints.points)
         mean, chains = stitched(posteriors, windows.starts, windows.step, frames, draws, seed)
     floor = float(np.median([_floor(posterior) for posterior in posteriors]))
     mirrored = other.score - estimate.score
-    evidence = Evidence(keypoints, fps, camera, level, mean, posteriors, mirrored)
+    evidence = Evidence(keypoints, fps, found, level, mean, posteriors, mirrored)
     if pitch is None:
         chains = _tilted(chains, estimate, seed)
-    return TrackLift(mean, chains, floor, camera, level, checked(evidence))
+    return TrackLift(mean, chains, floor, found, level, checked(evidence))
 
 
 def _windows(keypoints: PersonKeypoints, fps: float) -> _Windows:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+from threading import Lock
 from typing import NamedTuple
 
 import numpy as np
@@ -76,6 +77,7 @@ class WindowPrior:
         self.children = np.flatnonzero(parents >= 0)
         self.parents = parents[self.children]
         self._reduced: dict[int, ReducedComponent] = {}
+        self._lock = Lock()  # two threads fit windows
         self._screens: dict[tuple[int, ...], tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
 
     def cosines(self, times: np.ndarray) -> np.ndarray:
@@ -144,11 +146,12 @@ class WindowPrior:
         """
         step = round(pitch / _PITCH_STEP)
         key = (step, *joints)
-        if key not in self._screens:
-            while len(self._screens) >= _SCREENS:
-                self._screens.pop(next(iter(self._screens)))
-            self._screens[key] = self._views(step * _PITCH_STEP, joints)
-        precision, mean, offset = self._screens[key]
+        with self._lock:
+            if key not in self._screens:
+                while len(self._screens) >= _SCREENS:
+                    self._screens.pop(next(iter(self._screens)))
+                self._screens[key] = self._views(step * _PITCH_STEP, joints)
+            precision, mean, offset = self._screens[key]
         low = self.low
         coefficients = np.tensordot(self._cosines[:, :low], points, axes=(0, 0)).reshape(low, -1)
         deviation = (coefficients - mean).astype(np.float32)
