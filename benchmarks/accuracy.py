@@ -3,7 +3,7 @@
 Prints ``name: value`` lines. ``diffusion``: metrics of 400 draws (split Gibbs: 200, with five 2D
 views), mean over seeds.
 
-``lift``: see ``lift_figures.py``.
+``lift``: see ``lift_figures.py``; ``mixing``: see ``mixing_figures.py``.
 
 ``exact-priors``: coverages are mean distances from held-out pose pairs to the nearest lifted
 annotation in interaction coordinates, metres (:func:`probmotion.metrics.coverage.coverage`);
@@ -26,6 +26,7 @@ from pathlib import Path
 
 import numpy as np
 from lift_figures import lift_figures
+from mixing_figures import mixing_figures
 
 from probmotion import compare, seeds
 from probmotion.data.denoising_clips import denoising_clips
@@ -393,13 +394,15 @@ def main() -> None:
     commands.add_parser("diffusion", help="Diffusion samplers against exact posteriors.")
     command = commands.add_parser("lift", help="Lifts of made videos of held-out clips.")
     command.add_argument("--data", required=True, help="Folder with the real motions.")
+    commands.add_parser("mixing", help="Samplers of many modes within budgets.")
     options = parser.parse_args()
     if options.command == "lift":
         for name, value in lift_figures(Path(options.data)):
             print(f"{name}: {value:.4g}", flush=True)
         return
-    if options.command == "diffusion":
-        for name, value in diffusion_figures():
+    if options.command in ("diffusion", "mixing"):
+        figures = diffusion_figures() if options.command == "diffusion" else mixing_figures()
+        for name, value in figures:
             print(f"{name}: {value:.4g}", flush=True)
         return
     pairs = salsa(options.data, tuple(options.held_out))

@@ -2,8 +2,10 @@
 
 ``nuts_ratio``, ``ensemble_ratio``: processor seconds of our sampler over those of the library on
 the same density, start and random numbers; the script exits with an error if the draws differ.
-Both compile NUTS anew. Medians over interleaved repeats in one process. ``import_seconds``:
-``import probmotion`` in a new process, minimum of several. Float64, one thread.
+Both compile NUTS anew. Medians over interleaved repeats in one process.
+``…_density_fraction_…``: seconds in densities and their gradients over those of the sampler, on a
+problem with a cheap and one with a dear density. ``import_seconds``: ``import probmotion`` in a new
+process, minimum of several. Float64, one thread.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import emcee
 import jax
@@ -29,8 +32,9 @@ from numpyro.infer import (
 
 from probmotion import MotionPosterior, seeds
 from probmotion.problems import load_problem
-from probmotion.samplers import NUTS, Ensemble
+from probmotion.samplers import NUTS, Ensemble, ParallelTempering, SequentialMonteCarlo
 from probmotion.samplers.mcmc.nuts_kernel import compiled
+from probmotion.samplers.mcmc.tempering import Points, TemperedDensity
 
 SEED = 0
 
@@ -103,6 +107,31 @@ def ratio(ours: Callable[[], np.ndarray], theirs: Callable[[], np.ndarray], repe
     return float(np.median(ratios))
 
 
+def density_fraction(
+    sampler: ParallelTempering | SequentialMonteCarlo, posterior: MotionPosterior
+) -> float:
+    """Return the median fraction of a sampler's run time that is spent in densities."""
+    spent, points = 0.0, TemperedDensity.points
+
+    def timed(self: TemperedDensity, theta: np.ndarray, *options: Any, **others: Any) -> Points:
+        nonlocal spent
+        start = time.perf_counter()
+        result = points(self, theta, *options, **others)
+        spent += time.perf_counter() - start
+        return result
+
+    fractions = []
+    TemperedDensity.points = timed  # type: ignore[method-assign]
+    try:
+        for seed in range(3):
+            spent = 0.0
+            result = sampler.sample(posterior, draws=50, seed=seed, progress=False)
+            fractions.append(spent / result.seconds)
+    finally:
+        TemperedDensity.points = points  # type: ignore[method-assign]
+    return float(np.median(fractions))
+
+
 def import_seconds(repeats: int = 7) -> float:
     """Return the duration of ``import probmotion`` in a new process."""
 
@@ -127,6 +156,11 @@ def main() -> None:
         repeats=11,
     )
     print(f"ensemble_ratio: {ensemble_median:.3f}")
+    for name in ("gait-monocular", "gait-noisy3d"):
+        posterior = load_problem(name).posterior
+        for sampler in (ParallelTempering(warmup=50, thin=1), SequentialMonteCarlo(particles=64)):
+            fraction = density_fraction(sampler, posterior)
+            print(f"{sampler.name}_density_fraction_{name.replace('-', '_')}: {fraction:.3f}")
     mas = Path(__file__).with_name("mas_overhead.py")
     if mas.exists():
         subprocess.run([sys.executable, str(mas)], check=True)

@@ -17,6 +17,7 @@ _SOLVER = (
     "Lu, Zhou, Bao, Chen, Li, Zhu (2022). DPM-Solver++: fast solver for guided sampling of "
     "diffusion probabilistic models. arXiv:2211.01095."
 )
+_HMC = "Neal (2011). MCMC using Hamiltonian dynamics. Handbook of Markov Chain Monte Carlo."
 _MAS = (
     "Kapon, Tevet, Cohen-Or, Bermano (2024). MAS: multi-view ancestral sampling for 3D motion "
     "generation using 2D diffusion. CVPR."
@@ -89,6 +90,18 @@ CITATIONS: Mapping[str, tuple[str, ...]] = {
     "ensemble": (
         "Goodman, Weare (2010). Ensemble samplers with affine invariance. CAMCoS 5.",
         "Foreman-Mackey, Hogg, Lang, Goodman (2013). emcee: the MCMC hammer. PASP 125.",
+    ),
+    "tempered": (
+        "Syed, Bouchard-Côté, Deligiannidis, Doucet (2022). Non-reversible parallel tempering: a "
+        "scalable highly parallel MCMC scheme. JRSS B 84.",
+        _HMC,
+    ),
+    "smc": (
+        "Del Moral, Doucet, Jasra (2006). Sequential Monte Carlo samplers. JRSS B 68.",
+        "Neal (2001). Annealed importance sampling. Statistics and Computing 11.",
+        "Zhou, Johansen, Aston (2016). Toward automatic model comparison: an adaptive sequential "
+        "Monte Carlo approach. J. Comput. Graph. Stat. 25.",
+        _HMC,
     ),
 }
 """References by sampler name, without probmotion itself."""

@@ -14,4 +14,6 @@ from .mcmc.libraries import (
 )
 from .mcmc.metropolis import MetropolisHastings as MetropolisHastings
 from .mcmc.nuts import NUTS as NUTS
+from .mcmc.smc import SequentialMonteCarlo as SequentialMonteCarlo
+from .mcmc.tempered import ParallelTempering as ParallelTempering
 from .variational.dvae import DVAEInference as DVAEInference

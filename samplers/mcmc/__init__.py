@@ -1,4 +1,4 @@
-"""Markov chain Monte Carlo: Metropolis-Hastings, NUTS and the affine-invariant ensemble."""
+"""Markov chain Monte Carlo: Metropolis-Hastings, NUTS, ensembles, tempering and SMC."""
 
 import lazy_loader
 

@@ -15,3 +15,5 @@ from .proposals import (
     Proposal as Proposal,
     VelocityBiased as VelocityBiased,
 )
+from .smc import SequentialMonteCarlo as SequentialMonteCarlo
+from .tempered import ParallelTempering as ParallelTempering

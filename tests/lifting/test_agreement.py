@@ -1,4 +1,7 @@
-"""Agreement of the Gaussian modes of windows with NUTS on the exact density of each mode."""
+"""Agreement of the Gaussian modes of windows with NUTS on the exact density of each mode.
+
+Draws' spreads in lifts are larger than the modes' by a factor chosen on clips, which is left out.
+"""
 
 from functools import partial
 
@@ -46,7 +49,8 @@ def window(number):
     normalised = np.where(weight[..., None] > 0, camera.normalised(points), 0.0)
     path = body_path(keypoints)
     depth = camera.focal / smooth_size(path.size)
-    return prior, camera, Observed(normalised, weight, 4.0), camera.normalised(path.middle), depth
+    seen = Observed(normalised, weight, noise=4.0)
+    return prior, camera, seen, camera.normalised(path.middle), depth
 
 
 def log_density(z, design, offset, camera, seen, prior, bones):
@@ -93,11 +97,11 @@ def about_hips(positions):
 
 
 def compared(number):
-    """Compare fits with NUTS.
+    """Compare fits with NUTS; each value is a median over frames, joints and axes.
 
-    Returns differences of means in units of NUTS's standard deviation for the converged fit, the
-    fit as it is, and the converged fit without the force; then the ratio of standard deviations
-    of the converged fit, and R-hat. Each value is a median over frames, joints and axes.
+    Returns absolute differences of means in units of NUTS's standard deviation for the converged
+    fit, the fit as it is, and the converged fit without the force; then the ratio of the converged
+    fit's standard deviations to NUTS's, and R-hat of NUTS.
     """
     prior, camera, seen, middle, depth = window(number)
     times = np.arange(prior.frames)
@@ -150,15 +154,18 @@ def figures():
 
 
 def test_means_agree_with_nuts(figures):
-    assert np.median(figures[:, 4]) < 1.05
+    assert figures[:, 4].max() < 1.05
     assert np.median(figures[:, 0]) < 0.2
+    # Four rounds leave part of the way to the fixed point.
+    assert np.median(figures[:, 1]) < 0.5
 
 
 def test_the_force_is_needed(figures):
     converged, _, unforced = np.median(figures[:, :3], axis=0)
-    assert unforced > 1.5 * converged
+    assert unforced > 2 * converged
 
 
 def test_spreads_agree_with_nuts(figures):
-    # Weights that are taken as known make the Gaussian narrower, by up to √.75.
+    # The modes take the weights of outliers as known, which makes them narrower: by the factor
+    # √.75 of complete to observed information of a Student-t with four degrees of freedom.
     assert 0.75**0.5 - 0.03 < np.median(figures[:, 3]) < 1

@@ -151,6 +151,9 @@ class TwoModes:
         roots = np.linalg.cholesky(self.covariances)[chosen]
         return self.means[chosen] + (roots @ rng.standard_normal((n, 3, 1)))[..., 0]
 
+    def sample(self, rng, n):
+        return self.motion(self.initial(rng, n))
+
 
 @pytest.fixture(scope="session")
 def two_modes():

@@ -1,4 +1,4 @@
-"""Agreement of `exact`, `nuts`, `ensemble` and `mh` with posteriors in dense linear algebra.
+"""Agreement of `exact` and of Markov chains with posteriors in dense linear algebra.
 
 Each comparison divides the error of a mean over draws by its Monte Carlo standard error. The limit
 makes the family-wise failure rate 1/1000 (Bonferroni). Negative controls sample a slightly wrong
@@ -18,7 +18,14 @@ from scipy.stats import multivariate_normal, norm
 from probmotion import Cameras, Keypoints2D, Motion, MotionPosterior
 from probmotion.models import GaussianMixtureMotion
 from probmotion.motion.skeleton import Skeleton
-from probmotion.samplers import NUTS, Ensemble, ExactSampler, MetropolisHastings
+from probmotion.samplers import (
+    NUTS,
+    Ensemble,
+    ExactSampler,
+    MetropolisHastings,
+    ParallelTempering,
+    SequentialMonteCarlo,
+)
 from probmotion.samplers.mcmc.nuts_kernel import compiled
 
 L, J, K, RANK, AZIMUTHS = 3, 4, 2, 2, 4
@@ -28,6 +35,8 @@ SAMPLERS = {
     "nuts": (NUTS(warmup=300), 600, 4),
     "ensemble": (Ensemble(walkers=12, warmup=300, thin=10), 12 * 200, 2),
     "mh": (MetropolisHastings(warmup=1000, thin=6), 1000, 8),
+    "tempered": (ParallelTempering(rungs=6, warmup=175, thin=3, gradients=False), 500, 8),
+    "smc": (SequentialMonteCarlo(particles=500, moves=2, thin=20, gradients=False), 500, 8),
 }
 DIRECTIONS, QUANTILES = 6, (0.1, 0.5, 0.9)
 COMPARISONS = DIRECTIONS * (2 + len(QUANTILES)) * len(PROBLEMS) * len(SAMPLERS)
@@ -172,10 +181,10 @@ def test_samplers_agree_with_the_exact_posterior(name, problem, posteriors):
     ],
 )
 def test_samplers_of_a_slightly_wrong_posterior_fail(name, problem, posteriors, monkeypatch):
-    """Negative controls: chains target p^0.7; exact draws come from a wider prior."""
+    """Negative controls: a wider prior, or chains with target p^0.7."""
     right = MotionPosterior.log_density
     posterior = wrong = posteriors[problem]
-    if name == "exact":
+    if name in ("exact", "tempered", "smc"):
         wrong = replace(
             posterior, prior=replace(posterior.prior, factors=1.3 * posterior.prior.factors)
         )

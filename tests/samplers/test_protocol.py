@@ -33,6 +33,8 @@ QUICK = {
     "mh": {"warmup": 20, "thin": 2},
     "nuts": {"warmup": 20},
     "ensemble": {"warmup": 20, "thin": 2},
+    "tempered": {"warmup": 5, "thin": 1, "particles": 16},
+    "smc": {"particles": 16, "thin": 1},
     "dvae": {"training_steps": 5, "training_pairs": 200},
 }
 
@@ -129,7 +131,8 @@ def test_missing_protocols_are_named(sampler, minimal):
     posterior = MotionPosterior(minimal())
     assert suited(posterior) == []
     with pytest.raises(
-        UnsupportedPosterior, match=rf"^{sampler.name} needs a prior with \w+( or \w+)?, got Mi"
+        UnsupportedPosterior,
+        match=rf"^{sampler.name} needs a prior with \w+( (or|and) \w+)?, got Mi",
     ):
         sampler.sample(posterior, draws=1, progress=False)
 
@@ -153,7 +156,7 @@ def test_suited_samplers_are_those_that_sample(problem, name):
         kind(**effort).sample(posterior, draws=1, progress=False)
         return
     with pytest.raises(
-        UnsupportedPosterior, match=r"; try .*dvae, .*mh, .*nuts(, sds|, split-gibbs)?$"
+        UnsupportedPosterior, match=r"; try .*dvae, .*mh, .*nuts(, sds)?(, split-gibbs)?, .*smc.*"
     ):
         kind(**effort).sample(posterior, draws=1, progress=False)
 

@@ -16,7 +16,9 @@ from probmotion.samplers import (
     MetropolisHastings,
     MultiViewAncestral,
     MultiViewPredictorCorrector,
+    ParallelTempering,
     ScoreDistillation,
+    SequentialMonteCarlo,
 )
 from probmotion.samplers.diffusion.ancestral2d import Ancestral2D
 from probmotion.samplers.diffusion.guidance import DPS, MomentMatched, WeightedTriangulation
@@ -39,6 +41,10 @@ FREEDOM = "degrees_of_freedom must be a number above 0 or inf"
         (MetropolisHastings, {"proposal": VelocityBiased}, "proposal must be a proposal object"),
         (MetropolisHastings, {"proposal": "isotropic"}, r"such as Isotropic\(\), got 'isotropic'"),
         (Ensemble, {"walkers": 1}, f"walkers {COUNT} 2"),
+        (ParallelTempering, {"rungs": 1}, f"rungs {COUNT} 2, got 1"),
+        (ParallelTempering, {"warmup": -1}, f"warmup {COUNT} 0"),
+        (SequentialMonteCarlo, {"particles": 1}, f"particles {COUNT} 2"),
+        (SequentialMonteCarlo, {"moves": 0}, f"moves {COUNT} 1"),
         (NUTS, {"warmup": 0}, f"warmup {COUNT} 1"),
         (NUTS, {"target_acceptance": 1.0}, "target_acceptance must be between 0 and 1, got 1.0"),
         (Isotropic, {"scale": 0.0}, f"scale {POSITIVE}"),

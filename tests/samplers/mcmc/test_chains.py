@@ -7,15 +7,26 @@ import pytest
 
 from probmotion import MotionDraws, MotionPosterior
 from probmotion.posteriors.sampling import Interrupted
-from probmotion.samplers import NUTS, Ensemble, MetropolisHastings
-from probmotion.samplers.mcmc import nuts as nuts_module
+from probmotion.samplers import (
+    NUTS,
+    Ensemble,
+    MetropolisHastings,
+    ParallelTempering,
+    SequentialMonteCarlo,
+)
+from probmotion.samplers.mcmc import nuts as nuts_module, smc as smc_module
+from probmotion.samplers.mcmc.annealing import Population
+from probmotion.samplers.mcmc.ladder import Ladder
 
 SAMPLERS = {
     "mh": MetropolisHastings(warmup=60, thin=3, candidates=1),
     "ensemble": Ensemble(walkers=8, warmup=20, thin=5, candidates=1),
     "nuts": NUTS(warmup=60, candidates=1),
+    "tempered": ParallelTempering(rungs=4, warmup=20, thin=2, particles=8, candidates=1),
+    "smc": SequentialMonteCarlo(particles=8, thin=2, candidates=1),
 }
 DENSITY, CHUNK = (MotionPosterior, "log_density"), (nuts_module._Run, "_advance")
+SWEEPS, MOVES = (Ladder, "advance"), (smc_module._Run, "record")
 
 
 @pytest.fixture(scope="module", params=SAMPLERS)
@@ -82,6 +93,9 @@ def interrupt(monkeypatch, owner, name, n):
         ("ensemble", DENSITY, 1 + 2 * 2 * (20 + 3 * 5 + 2) + 1, 24),
         # The call is for the second chunk of draws of chain 1, after 2 chunks of warm-up each.
         ("nuts", CHUNK, 4 + 2 + 2, 50),
+        # The calls are for the second chain.
+        ("tempered", SWEEPS, 2 * 4 + 2, 4),
+        ("smc", MOVES, 2 * 3 + 2, 24),
     ],
 )
 def test_an_interrupted_run_can_be_continued(run, monkeypatch, name, method, n, finished):
@@ -95,7 +109,14 @@ def test_an_interrupted_run_can_be_continued(run, monkeypatch, name, method, n, 
 
 
 @pytest.mark.parametrize(
-    ("name", "method", "n"), [("mh", DENSITY, 30), ("ensemble", DENSITY, 20), ("nuts", CHUNK, 2)]
+    ("name", "method", "n"),
+    [
+        ("mh", DENSITY, 30),
+        ("ensemble", DENSITY, 20),
+        ("nuts", CHUNK, 2),
+        ("tempered", (Ladder, "sweep"), 25),
+        ("smc", (Population, "move"), 1),
+    ],
 )
 def test_an_interrupt_during_warm_up_has_no_draws(run, monkeypatch, name, method, n):
     interrupt(monkeypatch, *method, n)
@@ -104,6 +125,7 @@ def test_an_interrupt_during_warm_up_has_no_draws(run, monkeypatch, name, method
     assert not isinstance(stopped.value, Interrupted)
 
 
+@pytest.mark.parametrize("sampler", [SAMPLERS[name] for name in ("mh", "ensemble", "nuts")])
 def test_starts_of_density_zero_are_refused(sampler, run):
     shape = (2, 8, 3) if sampler.name == "ensemble" else (2, 3)
     points = 1e200 * (1 + np.random.default_rng(0).random(shape))
