@@ -24,11 +24,12 @@ ROWS = (
 def mixing_figures() -> Iterator[tuple[str, float]]:
     """Yield the smallest ``swd_ratio`` of the samplers, each a mean over seeds.
 
-    It is infinite if no sampler finishes within the budget.
+    It is infinite if no sampler finishes all seeds within the budget.
     """
     options = {"draws": DRAWS, "chains": CHAINS, "seeds": SEEDS, "workers": 2, "progress": False}
     for name, problem, seconds, samplers in ROWS:
         budget = Budget(seconds=seconds)
         table = compare(problem, samplers, budget=budget, **options).table()  # type: ignore[arg-type]
-        ratios = table[table["metric"] == "swd_ratio"].groupby("sampler")["value"].mean()
+        groups = table[table["metric"] == "swd_ratio"].groupby("sampler")["value"]
+        ratios = groups.mean()[groups.count() == SEEDS]
         yield name, float(ratios.min()) if len(ratios) else np.inf

@@ -26,6 +26,8 @@ WHEN = {
     "ensemble": "log density of at most about 20 dimensions, modes not far apart",
     "nuts": "log density with a gradient; start many chains and check R-hat",
     "mh": "log density without a gradient; start many chains and check R-hat",
+    "tempered": "log density with modes far apart, and a prior that can be sampled",
+    "smc": "the same; its evidence is estimated too",
     "ancestral3d": "3D denoiser",
     "split-gibbs": "observations and a 2D or 3D denoiser",
     "mvpc": "2D denoiser without observations",

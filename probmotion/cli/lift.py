@@ -52,8 +52,8 @@ class Lift:
     """Index of the person to lift; all by default."""
 
     fov: Annotated[float | None, arg(metavar="DEGREES", help_behavior_hint="")] = None
-    """Horizontal field of view, degrees: distances from the camera depend on it. By default 60, and
-    39 to 87 for 90 % of the draws."""
+    """Horizontal field of view, degrees: distances from the camera depend on it. By default 60
+    along the longer side, and 39 to 87 for 90 % of the draws."""
 
     pitch: Annotated[float | None, arg(metavar="DEGREES", help_behavior_hint="")] = None
     """Angle of the camera above the horizon, degrees, negative if it looks down. Estimated by
@@ -112,6 +112,8 @@ class Lift:
                 doubtful.append(str(folder))
         if len(refused) == len(people):
             raise refused[0]
+        if self.strict and refused:
+            raise refused[0]
         if self.strict and doubtful:
             raise ValueError(
                 f"motions must pass all checks with --strict, got failures in "
@@ -126,7 +128,12 @@ class Lift:
         if self.camera is not None and len(paths) == 1:
             paths = view_folders(paths[0])
         if self.camera is None and len(paths) > 1:
-            raise ValueError(f"camera must be given for several files, got {len(paths)} files")
+            raise ValueError(f"--camera must be given for several files, got {len(paths)} files")
+        if len(paths) > 1 and self.person is not None:
+            raise ValueError(
+                "--person must not be given with several cameras, whose people may have other "
+                f"numbers, got {self.person}; associate people before (pose-associated of Pose2Sim)"
+            )
         views = [self._tracks(path) for path in paths]
         if len(views) == 1:
             return [[track] for track in views[0]]

@@ -34,12 +34,13 @@ from probmotion.motion.motion import KeypointTrack
 from probmotion.posteriors.sampling import progress_bar
 from probmotion.threads import one_thread
 
-__all__ = ["CalibratedView", "LiftedViews", "calibrated_views", "lift_views"]
+__all__ = ["CalibratedView", "LiftedViews", "calibrated_views", "check_size", "lift_views"]
 
 _STEEPEST = 60.0  # roll of a camera, degrees
 _ACROSS, _ALONG = 0.1, 1.0  # of a body's middle: metres across a ray, and depths along it
 _UNSEEN = 1e-3  # weight of interpolated frames
 _SIZES = (0.4, 1.5)  # of people, relative to the prior's
+_MOST = 8  # views: the repair of sides compares all sets of views
 _ROUNDS = 2  # of the estimation of the size
 _TRIED = 3  # windows on which size and noise are estimated
 _FITTED = 0.9  # share of the residuals that the fit leaves
@@ -87,6 +88,8 @@ def calibrated_views(
     ValueError
         If tracks do not match the cameras or each other.
     """
+    if len(tracks) > _MOST:
+        raise ValueError(f"tracks must be of at most {_MOST} cameras, got {len(tracks)}")
     found = calibration.matched([track.name for track in tracks])
     for what, values in (
         ("number of frames", [track.frames for track in tracks]),
@@ -121,7 +124,7 @@ def _view(track: KeypointTrack, calibration: Calibration, index: int) -> Calibra
     keypoints = person_keypoints(track)
     seen = keypoints.weight > 0
     limbs = int((seen.sum(axis=1) >= 6).sum())
-    if limbs < max(_FEWEST, _SHARE * track.frames):
+    if limbs < min(track.frames, max(_FEWEST, _SHARE * track.frames)):
         raise ValueError(
             f"every camera must show the person, got {limbs} of {track.frames} frames with six "
             f"limb joints in {name}; leave it out"
@@ -214,6 +217,7 @@ def lift_views(
     keypoints = consistent_sides([view.keypoints for view in views], cameras)
     coarse = [averaged(each, step) for each in keypoints]
     path, apparent = _located(cameras, coarse)
+    check_size(apparent)
     recording = _Recording(coarse, cameras, path, prior)
     first = noise or guess
     with one_thread(), progress_bar(len(starts), "lift", progress) as bar:
@@ -270,14 +274,18 @@ def _located(cameras: LevelCameras, views: Sequence[PersonKeypoints]) -> tuple[n
     return middle, float(np.median(np.concatenate(ratios)))
 
 
+def check_size(size: float) -> None:
+    """Refuse calibrations in which a person has an unlikely size, relative to 1.7 m."""
+    low, high = _SIZES
+    if not low <= size <= high:
+        raise ValueError(
+            "calibration must be in metres, with the floor near z = 0 and of the cameras of these "
+            f"keypoints, got a person of about {1.7 * size:.2g} m"
+        )
+
+
 def _size(recording: _Recording, apparent: float, starts: Sequence[int], noise: float) -> float:
     """Return the person's size relative to the prior's, from the bones of some windows."""
-    low, high = _SIZES
-    if not low <= apparent <= high:
-        raise ValueError(
-            f"calibration must be in metres and of the cameras of these keypoints, got a person "
-            f"of about {1.7 * apparent:.2g} m"
-        )
     size, bones = apparent, PERSON.n_joints - 1
     for _ in range(_ROUNDS):
         parts = [recording.sized(size).posterior(start, noise, 2) for start in starts]

@@ -47,7 +47,7 @@ class Evidence(NamedTuple):
     """Keypoints, frame rate, camera, noise (pixels), mean (L, J, 3) and windows' posteriors.
 
     ``mirrored`` is the log evidence per window of keypoints with exchanged sides, minus that of the
-    given ones.
+    given ones; with an estimated pitch, both include the tempered log density of the pitch.
     """
 
     keypoints: PersonKeypoints
@@ -84,10 +84,10 @@ def checked(evidence: Evidence) -> tuple[Check, ...]:
     """Return all checks.
 
     ``noise``: that of keypoints, in metres at the person's distance. ``residual``: largest ratio of
-    a joint's robust residuals to the noise. ``unsteady``: speed of a motion that feet and body have
-    in common, metres per second. ``posture``, ``surprise`` and ``proportions``: mean squares of
-    standardised coefficients of the mean posture, of the motion and of bone lengths. ``mirrored``:
-    log evidence per window of exchanged sides.
+    a joint's robust residuals to the noise. ``unsteady``: the smaller of the slower ankle's speed
+    and of the hips' deviation from a steady velocity, metres per second. ``posture``, ``surprise``
+    and ``proportions``: mean squares of standardised coefficients of the mean posture, of the
+    motion and of bone lengths. ``mirrored``: score of exchanged sides, minus that of the given.
     """
     points, weight, _ = evidence.keypoints
     residual = np.linalg.norm(points - evidence.camera.pixels(evidence.mean), axis=-1)

@@ -15,6 +15,7 @@ from probmotion.lifting.calibrated import (
     CalibratedView,
     LiftedViews,
     calibrated_views,
+    check_size,
     lift_views,
 )
 from probmotion.lifting.camera import LevelCamera
@@ -28,7 +29,7 @@ from probmotion.validation import check_count, check_positive
 __all__ = ["lift"]
 
 _SLOWEST = 5.0  # frame rate
-_FOV = 60.0  # median of the horizontal field of view, degrees
+_FOV = 60.0  # median field of view along the longer side, degrees
 _FOCAL_SPREAD = 0.3  # of the logarithm of the focal length: 90 % of fields of view are 39° to 87°
 _HEIGHT, _HEIGHT_SPREAD = 1.7, 0.06  # of adults: mean, metres, and relative standard deviation
 _MEASURED = 0.01  # relative standard deviation of a given height
@@ -54,8 +55,11 @@ def lift(
     The recording is cut into windows of two seconds that overlap by half. Each has a mixture of
     Gaussian approximations (:mod:`probmotion.lifting.window_fit`) under the prior
     ``cmu-motion``. Means are averaged with weights that fall linearly to 0 at a window's ends; each
-    draw continues from the previous window's. The pitch of the camera and the keypoints' noise are
-    those of the largest evidence in three windows.
+    draw continues from the previous window's. The pitch of an uncalibrated camera and the noise of
+    the keypoints are estimated in three windows.
+
+    Draws of an uncalibrated camera have pitches, focal lengths and sizes of their own, drawn
+    independently of the path: the paths are approximate, and cameras differ in height.
 
     Parameters
     ----------
@@ -71,8 +75,8 @@ def lift(
         motion is in their world, with y up. With one track, the floor is near y = 0.
     fov : float, optional
         Horizontal field of view, degrees. Distances from the camera are proportional to the focal
-        length, which one still view hardly determines: by default, it is 60°, and each draw has its
-        own (90 % are 39° to 87°).
+        length, which one still view hardly determines: by default, it is 60° along the image's
+        longer side, and each draw has its own (90 % are 39° to 87°).
     pitch : float, optional
         Angle of the camera above the horizon, degrees, negative if it looks down; estimated by
         default.
@@ -180,7 +184,8 @@ def _before_camera(
     keypoints = person_keypoints(track)
     _check_visible(keypoints.weight, track)
     _check_inside(keypoints, image_size)
-    focal = 0.5 * image_size[0] / np.tan(np.radians(fov or _FOV) / 2)
+    side = max(image_size) if fov is None else image_size[0]
+    focal = 0.5 * side / np.tan(np.radians(fov or _FOV) / 2)
     camera = LevelCamera(focal, (image_size[0] / 2, image_size[1] / 2))
     known = None if pitch is None else float(np.radians(pitch))
     seen = settings.lift(keypoints, track.fps, camera, known, _NOISE * max(image_size))
@@ -193,8 +198,8 @@ def _before_camera(
         chains = chains.copy()
         chains[..., 2] += (ratio - 1) * chains[:, :, :1, 2]
     scale, spread = settings.size
-    # Size and distance are proportional: the camera stays where it is.
-    draws = scale * (chains * _sizes(spread, settings) - [0.0, seen.floor, 0.0])
+    # Size, distance and the camera's height are proportional.
+    draws = scale * (chains - [0.0, seen.floor, 0.0]) * _sizes(spread, settings)
     mean = scale * (seen.mean - [0.0, seen.floor, 0.0])
     placed = replace(seen.camera, position=(0.0, -scale * seen.floor, 0.0))
     return Lift(
@@ -263,6 +268,7 @@ def _placed(view: CalibratedView, fps: float, guess: float, settings: _Settings)
     precisions = np.array([spread**-2, (seen.floor * scale / _LEVEL) ** 2])
     ratio = float(precisions @ [1.0, -height / (seen.floor * scale)] / precisions.sum())
     scale, spread = scale * ratio, float(precisions.sum() ** -0.5)
+    check_size(scale)
     turn = rotation(view.camera.heading).T
     mean, draws = (
         scale * positions @ turn + view.camera.position

@@ -22,6 +22,8 @@ def consistent_sides(
 ) -> list[PersonKeypoints]:
     """Return the keypoints of V views with the sides on which most views agree.
 
+    Where as many views disagree, those of the first views are kept.
+
     Rays of two views to one joint meet. For arms and legs, the cheapest sequence of sets of views
     with exchanged sides (Viterbi) has the smallest sum of log(1 + d²/σ²) over pairs of views, with
     the distances d of rays, and of costs of exchanges and of changes.
@@ -50,7 +52,7 @@ def consistent_sides(
             weight[v][frames, joints] = views[v].weight[frames, mirrored]
             shares[v] += len(frames) / len(points[v]) / len(SIDED)
     return [
-        PersonKeypoints(points[v], weight[v], view.swapped + float(shares[v]))
+        PersonKeypoints(points[v], weight[v], min(1.0, view.swapped + float(shares[v])))
         for v, view in enumerate(views)
     ]
 

@@ -76,7 +76,10 @@ class _Windows(NamedTuple):
 
 
 class TrackLift(NamedTuple):
-    """Mean and draws for a person of 1.7 m about the camera, its floor's height, and the rest."""
+    """Mean and draws relative to the camera for a person of 1.7 m, and what was estimated.
+
+    ``floor`` is the height of the floor relative to the camera.
+    """
 
     mean: np.ndarray
     draws: np.ndarray
@@ -192,7 +195,7 @@ def _log_pitch(pitch: np.ndarray) -> np.ndarray:
 def _tilted(draws: np.ndarray, estimate: _Estimate, seed: int) -> np.ndarray:
     """Return the draws, each for a pitch of its own: turned about the camera.
 
-    The pelvis stays at its mean height, as the floor's height relative to the camera is unknown.
+    The pelvis keeps its height, as the floor is level.
     """
     rng = seeds.generator(seed, "lift: pitch")
     count = len(draws)
@@ -200,7 +203,7 @@ def _tilted(draws: np.ndarray, estimate: _Estimate, seed: int) -> np.ndarray:
     turn = estimate.pitches[chosen] - estimate.pitch + _PITCH_ERROR * rng.standard_normal(count)
     vectors = turn[:, None] * [1.0, 0.0, 0.0]
     turned: np.ndarray = draws @ vector_to_matrix(vectors)[:, None].swapaxes(-1, -2)
-    turned[..., 1] -= (turned - draws)[..., :1, 1].mean(axis=1, keepdims=True)
+    turned[..., 1] -= (turned - draws)[..., :1, 1]
     return turned
 
 

@@ -13,7 +13,7 @@ from probmotion.models.mixture.conditioning import rotation
 __all__ = ["FLOOR_SPREAD", "TEMPER", "WindowGaussian", "WindowMode", "WindowPosterior"]
 
 FLOOR_SPREAD = 0.3
-"""Standard deviation of the floor's height relative to the camera, metres."""
+"""Standard deviation of the floor's height about the window's origin, metres."""
 TEMPER, _INFLATION = 0.03, 2.0
 """Power of the modes' probabilities, and factor of standard deviations.
 
@@ -86,7 +86,10 @@ class WindowGaussian:
 
 @dataclass(frozen=True, eq=False)
 class WindowPosterior:
-    """Mixture of modes of one window; positions are relative to the camera, metres."""
+    """Mixture of modes of one window.
+
+    Positions are relative to the camera, or in the world of several cameras, metres.
+    """
 
     prior: WindowPrior
     origin: np.ndarray

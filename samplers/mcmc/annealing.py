@@ -22,6 +22,7 @@ from probmotion.samplers.mcmc.tempering import (
 __all__ = ["ANNEALING_TICKS", "Level", "Population"]
 
 _CONDITIONAL_ESS = 0.97  # of the particles, between successive powers
+_POSSIBLE = 10  # draws of the prior with a positive likelihood, at least
 _RESAMPLED = 0.5  # effective fraction of the particles below which they are resampled
 _LOG_RANGE = 60.0  # range of the logarithm of a rise
 _PAIRS = 256  # pairs of points for which a rejection is estimated
@@ -68,13 +69,15 @@ class Population:
         Raises
         ------
         ValueError
-            If the likelihood is 0 at all draws.
+            If the likelihood is 0 at all draws but a few.
         """
         points = density.values(density.posterior.initial(rng, draws), np.zeros(draws))
-        if not np.isfinite(points.log_likelihood).any():
+        possible = int(np.isfinite(points.log_likelihood).sum())
+        if possible < min(_POSSIBLE, draws):
+            # Fewer would be taken for the whole posterior.
             raise ValueError(
-                f"likelihood must be positive at some draw of the prior, got 0 at all {draws}; use "
-                "more candidates or another prior"
+                f"likelihood must be positive at {min(_POSSIBLE, draws)} or more draws of the "
+                f"prior, got {possible} of {draws}; use more candidates or another prior"
             )
         step = 0.5 if density.differentiable else 2.38 / math.sqrt(density.posterior.dim)
         return cls(density, rng, points, np.empty(0), step)

@@ -28,10 +28,12 @@ class SequentialMonteCarlo:
     """Annealed sequential Monte Carlo (Neal 2001, Del Moral et al. 2006).
 
     Draws of the prior are weighted by the likelihood to increasing powers, resampled and moved, so
-    that they find all modes in proportion to their mass. A chain is one population of particles.
-    Its draws are the particles after ``thin`` moves, then again after ``thin`` more. The result
-    contains the estimated log marginal likelihood (``log_evidence``) and the number of powers
-    (``levels``) of each chain.
+    that they represent the modes that draws of the prior reach, approximately in proportion to
+    their mass. A chain is one population of particles. Its draws are the particles after ``thin``
+    moves, then again after ``thin`` more. They share ancestors: the effective sample size of a
+    chain is too large, and only R-hat of several populations detects wrong proportions of modes.
+    The result contains a consistent estimate of the log marginal likelihood (``log_evidence``) and
+    the number of powers (``levels``) of each chain.
 
     Parameters
     ----------

@@ -118,8 +118,10 @@ class ParallelTempering:
                     for ladder in ladders:
                         row.append(ladder.advance(self.thin))
                         bar.update(self.thin)
+                    latest = [ladder.state() for ladder in ladders]
+                    # An interrupt finds both or neither.
                     finished.append(row)
-                    states = [ladder.state() for ladder in ladders]
+                    states = latest
         except KeyboardInterrupt as stop:
             if not finished:
                 raise

@@ -110,6 +110,8 @@ class TemperedDensity(Density):
             return self.values(theta, power, counted)
         self.gradient_evaluations += counted * len(theta)
         log_prior, log_likelihood, *gradients = self._split(theta)
+        # The likelihood may be NaN where the prior is 0.
+        log_likelihood = np.where(log_prior == -np.inf, -np.inf, log_likelihood)
         impossible = ~np.isfinite(log_prior + log_likelihood)
         if impossible.any():
             # Where the density is 0, gradients may be NaN and are not used.
@@ -254,6 +256,7 @@ def _trajectory(
     momentum = momentum + 0.5 * size * _pulled(root, now.gradient(power))
     for i in range(n_steps):
         theta = now.theta + size * _spread(root, momentum)
+        going &= np.isfinite(theta).all(axis=1)
         now = density.points(np.where(going[:, None], theta, points.theta), power)
         # The points of divergent trajectories stay where they were.
         going &= fixed | (now.log_density(power) > energy - _DIVERGENT)
@@ -274,7 +277,7 @@ def _chosen(
     """Return accepted or earlier points, and acceptance probabilities; accept ``fixed`` points."""
     log_acceptance = np.where(fixed, 0.0, np.minimum(0.0, log_ratio))
     # −log U is standard exponential for U uniform on (0, 1].
-    accepted = -rng.standard_exponential(len(fixed)) < log_acceptance
+    accepted = -rng.standard_exponential(len(fixed)) <= log_acceptance
     return proposed.where(accepted, points), np.exp(log_acceptance)
 
 

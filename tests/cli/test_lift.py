@@ -124,7 +124,7 @@ def test_wrong_cameras_are_named(fails, trial, detections, tmp_path):
     cases = {
         (detections, "--camera", toml): "must be named after the calibrated cameras cam_2, cam_10",
         (detections, one, "--camera", toml): "must be of one person, got 2 in",
-        (one, one, *SIZE): "camera must be given for several files, got 2 files",
+        (one, one, *SIZE): "--camera must be given for several files, got 2 files",
         (one,): "--image-size or --camera must be given",
         (one, "--camera", one / "cam2.000.json"): "expected TOML",
         (one, "--camera", toml, "--image-size", "9", "9"): "that of the calibration, 1000 × 1000",
