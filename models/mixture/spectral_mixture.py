@@ -439,7 +439,7 @@ class SpectralMixtureMotion:
         try:
             archive = read_arrays(path)
             header = json.loads(str(archive["header"]))
-            arrays = {name: archive[name] for name in (*_ROUNDED, *_EXACT)}
+            arrays: dict[str, Any] = {name: archive[name] for name in (*_ROUNDED, *_EXACT)}
             arrays |= {name: arrays[name].astype(np.float64) for name in _ROUNDED}
             if header["format"] != _FORMAT:
                 raise ValueError(f"format {header['format']}")

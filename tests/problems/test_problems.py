@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from probmotion import MotionPosterior
-from probmotion.comparison.results.naming import _NAME
+from probmotion.comparison.results.folder_names import _NAME
 from probmotion.posteriors.problem import Problem
 from probmotion.problems import load_problem
 from probmotion.problems.gait import GAIT_PROBLEMS

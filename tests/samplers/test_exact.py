@@ -41,11 +41,11 @@ def test_prior_without_observations_is_sampled_directly():
     assert ExactSampler().sample(untruncated, draws=3, progress=False).independent
 
 
-def test_posteriors_without_a_closed_form_are_refused(mixture, mixture_posterior, two_modes):
+def test_posteriors_without_a_closed_form_are_refused(mixture, mixture_posterior, minimal):
     outliers = Joints3D(np.zeros((2, 2, 3)), noise=0.5, degrees_of_freedom=4.0)
     likelihood = mixture_posterior.likelihood
     for posterior, message, word in (
-        (MotionPosterior(two_modes), "needs a prior with HasExactPosterior", "HasExactPosterior"),
+        (MotionPosterior(minimal()), "needs a prior with HasExactPosterior", "HasExactPosterior"),
         (
             MotionPosterior(Normal(), Joints3D(np.zeros((2, 1, 3)), noise=0.5)),
             "requires a prior that implements HasExactPosterior for observations, got Normal",
