@@ -16,7 +16,8 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	touch $@
 
 demo: install
-	@$(BIN)/probmotion compare gait gait-monocular --quick --draws 400 --workers 2 --out demo --report --figures
+	@$(BIN)/probmotion compare gait gait-monocular --quick --draws 400 --workers 2 --out demo --report --figures \
+		--samplers exact ancestral3d split-gibbs mvpc mas sds mh nuts tempered smc
 	@$(BIN)/probmotion lift notebooks/keypoints/walk.json --image-size 1000 1000 --out demo/lift
 	@$(BIN)/probmotion show demo/lift/lift.npz --figure demo/lift.png
 

@@ -28,6 +28,7 @@ from probmotion.comparison.results.plan import Plan
 from probmotion.comparison.results.stored_problems import StoredProblem, read_stored, store_problem
 from probmotion.comparison.results.table import ComparisonTable
 from probmotion.plots.motion_data import Shown, motion_numbers
+from probmotion.posteriors.sampling import sampler_names
 from probmotion.report.animations import (
     BUDGET,
     compared_draws,
@@ -35,6 +36,7 @@ from probmotion.report.animations import (
     shown_problems,
 )
 from probmotion.report.page import write_report
+from probmotion.report.tables import sampler_name
 from probmotion.samplers import ExactSampler, ScoreDistillation
 
 SAMPLERS = {"good": 1.25, "b<i>ad": 5.5, "none": None}
@@ -353,3 +355,8 @@ def test_figures_reduce_the_budget_of_the_motions(made, tmp_path, monkeypatch):
     figures = [base64.b64decode(text) for text in re.findall(r';base64,([^"]*)" alt', page)]
     assert len(figures) == len(made.plan.problems) + 1
     assert budgets == [BUDGET - sum(map(len, figures))]
+
+
+def test_every_sampler_has_a_mark_in_tables():
+    for name in sampler_names():
+        assert f"</svg> {name}" in sampler_name(name)
