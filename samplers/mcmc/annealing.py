@@ -11,7 +11,6 @@ import numpy as np
 from scipy.optimize import brentq
 
 from probmotion.samplers.mcmc.tempering import (
-    POINTS_PER_DIMENSION,
     Points,
     TemperedDensity,
     covariance_root,
@@ -22,6 +21,7 @@ from probmotion.samplers.mcmc.tempering import (
 __all__ = ["ANNEALING_TICKS", "Level", "Population"]
 
 _CONDITIONAL_ESS = 0.97  # of the particles, between successive powers
+_PER_DIMENSION = 4  # particles from which correlations are estimated
 _POSSIBLE = 10  # draws of the prior with a positive likelihood, at least
 _RESAMPLED = 0.5  # effective fraction of the particles below which they are resampled
 _LOG_RANGE = 60.0  # range of the logarithm of a rise
@@ -95,7 +95,7 @@ class Population:
         ``particles``, so many are resampled, and ``moves`` moves of all follow each power. ``tick``
         is called with parts of ``ANNEALING_TICKS``.
         """
-        full = particles >= POINTS_PER_DIMENSION * self.points.theta.shape[1]
+        full = particles >= _PER_DIMENSION * self.points.theta.shape[1]
         weights = np.full(self.size, 1 / self.size)
         self.root = covariance_root(self.points.theta, weights, full)
         levels, done = [self._level(weights, 0.0)], 0

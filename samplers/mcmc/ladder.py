@@ -136,7 +136,7 @@ class Ladder:
         acceptance, rejected, arrived = zip(*(self.sweep() for _ in range(sweeps)), strict=True)
         self.draws += 1
         return LadderDraw(
-            self.points.theta[-1],
+            self.points.theta[-1].copy(),
             float(self.points.log_density(self.powers)[-1]),
             float(np.mean([row[-1] for row in acceptance])),
             1 - float(np.mean(rejected)),

@@ -92,7 +92,7 @@ class SequentialMonteCarlo:
             On Ctrl-C, with the finished draws.
         """
         check_count("draws", draws)
-        density = TemperedDensity(self, posterior, self.gradients, "particle")
+        density = TemperedDensity(self, posterior, self.gradients)
         start = time.perf_counter()
         check_initial(self.name, initial)
         earlier = continued(self, posterior.log_density, initial, chains, seed)

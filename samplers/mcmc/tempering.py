@@ -15,7 +15,6 @@ from probmotion.samplers.densities import Density, not_conjugate
 from probmotion.samplers.mcmc.split_gradients import SplitGradient, split_gradient
 
 __all__ = [
-    "POINTS_PER_DIMENSION",
     "Points",
     "TemperedDensity",
     "check_initial",
@@ -27,9 +26,6 @@ __all__ = [
 _JITTER = 0.2  # relative range of step sizes, against periodic trajectories
 _LONGEST = 20  # maximum number of leapfrog steps
 _DIVERGENT = 1000.0  # loss of log density, nats, at which a trajectory ends
-
-POINTS_PER_DIMENSION = 4
-"""Number of points per dimension from which correlations are estimated."""
 
 
 class Points(NamedTuple):
@@ -70,15 +66,11 @@ class Points(NamedTuple):
 class TemperedDensity(Density):
     """Log prior and log likelihood of a posterior, with counters of evaluations.
 
-    ``gradients`` selects Hamiltonian moves if JAX or torch differentiates both parts. ``noun``
-    names a point in error messages.
+    ``gradients`` selects Hamiltonian moves if JAX or torch differentiates both parts.
     """
 
-    def __init__(
-        self, sampler: Sampler, posterior: MotionPosterior, gradients: bool, noun: str
-    ) -> None:
+    def __init__(self, sampler: Sampler, posterior: MotionPosterior, gradients: bool) -> None:
         super().__init__(sampler, posterior)
-        self.noun = noun
         self.gradient_evaluations = 0
         self._split: SplitGradient | None = None
         if gradients:
@@ -104,7 +96,7 @@ class TemperedDensity(Density):
         Raises
         ------
         ValueError
-            If a density is NaN or +∞; names the replica or particle.
+            If a density is NaN or +∞; names the point and its power.
         """
         if self._split is None:
             return self.values(theta, power, counted)
@@ -143,7 +135,7 @@ class TemperedDensity(Density):
             bad = int(np.flatnonzero(~valid)[0])
             total = points.log_prior + points.log_likelihood
             raise ValueError(
-                f"log_density must be finite or -inf, got {total[bad]} at {self.noun} {bad + 1} of "
+                f"log_density must be finite or -inf, got {total[bad]} at point {bad + 1} of "
                 f"{len(power)}, with likelihood to the power {power[bad]:.3g}, theta "
                 f"{points.theta[bad]}"
             )

@@ -43,7 +43,7 @@ def test_every_person_has_a_folder(capsys, detections, tmp_path):
     assert text.count("The camera is") == 2
 
 
-def test_people_who_are_hardly_visible_are_named(capsys, detections, tmp_path):
+def test_people_who_are_hardly_visible_are_named(capsys, fails, detections, tmp_path):
     results = json.loads(detections.read_text(encoding="utf-8"))
     few = [each for each in results if each["idx"] == 0 or int(each["image_id"][:-4]) % 5 == 0]
     path = tmp_path / "few.json"
@@ -52,6 +52,8 @@ def test_people_who_are_hardly_visible_are_named(capsys, detections, tmp_path):
     assert main(["lift", str(path), "--fps", "30", *SIZE, "--draws", "2", "--out", str(out)]) == 0
     assert "person 1 was not lifted: track must show the person" in capsys.readouterr().out
     assert [folder.name for folder in out.iterdir()] == ["person-0"]
+    strict = ["--strict", "--draws", "2", "--out", str(tmp_path / "strict")]
+    assert "track must show the person" in fails("lift", str(path), "--fps", "30", *SIZE, *strict)
 
 
 def test_errors_are_one_line_and_leave_no_files(fails, detections, tmp_path):
@@ -126,6 +128,7 @@ def test_wrong_cameras_are_named(fails, trial, detections, tmp_path):
         (detections, one, "--camera", toml): "must be of one person, got 2 in",
         (one, one, *SIZE): "--camera must be given for several files, got 2 files",
         (one,): "--image-size or --camera must be given",
+        (folder, "--camera", toml, "--person", "0"): "--person must not be given with several",
         (one, "--camera", one / "cam2.000.json"): "expected TOML",
         (one, "--camera", toml, "--image-size", "9", "9"): "that of the calibration, 1000 × 1000",
     }

@@ -46,6 +46,17 @@ def test_people_may_be_absent_for_two_windows(video):
     assert spread[120:150].mean() > 1.5 * spread[30:60].mean()
 
 
+def test_eight_frames_are_enough(video):
+    track = video.track
+    few = slice(0, 16, 2)
+    short = replace(
+        track, keypoints=track.keypoints[few], confidence=track.confidence[few], fps=track.fps / 2
+    )
+    result = lift(short, image_size=video.size, progress=False, draws=2)
+    assert result.mean.frames == 8
+    assert all(np.isfinite(check.value) for check in result.checks)
+
+
 def test_draws_depend_on_the_seed_alone(video, lifted):
     again = lift(video.track, image_size=video.size, progress=False, draws=40)
     assert np.array_equal(again.draws, lifted.draws)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -68,6 +70,25 @@ def test_draws_have_the_moments_of_the_modes(window_prior):
     # More noise, more spread.
     wide = lift(window_prior, CAMERA, observed(window_prior, 40.0)[1], np.full(20, 4.0))
     assert wide.sample(np.random.default_rng(0), 400, times).std(axis=0).mean() > spread.mean()
+
+
+def test_postures_unlike_the_clips_have_wider_intervals(window_prior):
+    _, seen = observed(window_prior, noise=4.0)
+    posterior = lift(window_prior, CAMERA, seen, np.full(20, 4.0), candidates=1)
+    mode, part = posterior.best, window_prior.component(posterior.best.component)
+    square = [
+        mode.scale * z**2
+        for z, frequency, ground in zip(mode.mean, part.frequency, part.ground, strict=False)
+        if frequency == 0 and not ground
+    ]
+    assert mode.posture == pytest.approx(np.mean(square))
+
+    def spread(posture: float) -> float:
+        changed = replace(posterior, modes=(replace(mode, posture=posture),))
+        return changed.sample(np.random.default_rng(0), 50, np.arange(20.0)).std(axis=0).mean()
+
+    assert spread(4.0) == pytest.approx(2 * spread(1.0))
+    assert spread(0.1) == spread(1.0)
 
 
 def test_draws_continue_earlier_ones(window_prior):

@@ -149,7 +149,7 @@ def test_the_evidence_of_smc_agrees_with_the_exact_one(likelihood, gradients):
 def test_moves_leave_the_tempered_posterior_invariant(gradients, power):
     """Points that start as exact draws remain exact; a draw of the prior replaces the first."""
     posterior = MotionPosterior(Broad(), ONE)
-    density = TemperedDensity(SMC, posterior, gradients, "particle")
+    density = TemperedDensity(SMC, posterior, gradients)
     precision = 1 / WIDTH**2 + power / 0.04
     mean, deviation = power / 0.04 * ONE.centres[0] / precision, precision**-0.5
     rng, n = np.random.default_rng(3), 20_000
@@ -172,7 +172,7 @@ def test_moves_leave_the_tempered_posterior_invariant(gradients, power):
 
 def ladder_of(posterior, rungs=5):
     """Return a ladder whose replicas are away from their targets."""
-    density = TemperedDensity(TEMPERED, posterior, False, "replica")
+    density = TemperedDensity(TEMPERED, posterior, False)
     return Ladder.begin(density, seeds.generator(0), rungs, 32, 500, lambda n: None)
 
 
@@ -266,15 +266,11 @@ def faulty(value, limit):
     )
 
 
-@pytest.mark.parametrize(
-    ("sampler", "point"),
-    [(TEMPERED, "replica|particle"), (SMC, "particle")],
-    ids=["tempered", "smc"],
-)
+@pytest.mark.parametrize("sampler", [TEMPERED, SMC], ids=lambda sampler: sampler.name)
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_a_density_that_is_nan_names_its_point(sampler, point, value):
+def test_a_density_that_is_nan_names_its_point(sampler, value):
     message = (
-        rf"log_density must be finite or -inf, got {value} at {point} \d+ of \d+, with likelihood "
+        rf"log_density must be finite or -inf, got {value} at point \d+ of \d+, with likelihood "
         r"to the power 0, theta \[ ?\d"
     )
     with pytest.raises(ValueError, match=message):
@@ -296,6 +292,9 @@ def test_unusable_posteriors_are_refused(sampler, two_modes, minimal):
     n = sampler.candidates
     with pytest.raises(ValueError, match=rf"likelihood must be positive .*, got 0 of {n}; use"):
         sampler.sample(faulty(-math.inf, -1e9), draws=2, progress=False)
+    # About one draw of N(0, 16) in 500 is below −11.5: too few to represent the posterior.
+    with pytest.raises(ValueError, match=rf"at 10 or more draws of the prior, got \d of {n}; use"):
+        sampler.sample(faulty(-math.inf, -11.5), draws=2, progress=False)
     with pytest.raises(ValueError, match="initial must be None or an earlier run, got ndarray: "):
         sampler.sample(faulty(0.0, 9.0), initial=np.zeros((1, 3)), progress=False)
 
