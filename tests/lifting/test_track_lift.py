@@ -65,6 +65,14 @@ def test_draws_depend_on_the_seed_alone(video, lifted):
     assert not np.array_equal(other.draws, lifted.draws)
 
 
+def test_a_camera_that_looks_down_is_found():
+    video = film(make_gait("walk", 3, frames=60), 0, azimuth=0.8, height=2.4)
+    distance = np.linalg.norm(video.motion.positions[:, 0, [0, 2]], axis=-1).mean()
+    result = lift(video.track, image_size=video.size, progress=False, draws=2)
+    true = -np.degrees(np.arctan2(1.4, distance))
+    assert np.degrees(result.camera.pitch) == pytest.approx(true, abs=6)
+
+
 def test_a_given_pitch_is_kept(video, lifted):
     # The made camera is at 1.4 m and looks at a point 1 m above the floor.
     distance = np.linalg.norm(video.motion.positions[:, 0, [0, 2]], axis=-1).mean()

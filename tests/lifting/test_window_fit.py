@@ -72,7 +72,8 @@ def test_draws_have_the_moments_of_the_modes(window_prior):
     assert wide.sample(np.random.default_rng(0), 400, times).std(axis=0).mean() > spread.mean()
 
 
-def test_postures_unlike_the_clips_have_wider_intervals(window_prior):
+def test_postures_unlike_the_clips_have_wider_intervals(window_prior, monkeypatch):
+    monkeypatch.setattr(window_prior, "scales", np.array([4.0]))
     _, seen = observed(window_prior, noise=4.0)
     posterior = lift(window_prior, CAMERA, seen, np.full(20, 4.0), candidates=1)
     mode, part = posterior.best, window_prior.component(posterior.best.component)
