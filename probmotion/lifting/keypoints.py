@@ -12,13 +12,14 @@ from probmotion.motion.retargeting import counterpart
 from probmotion.motion.skeleton import Skeleton
 
 __all__ = [
-    "SIDED", "BodyPath", "PersonKeypoints", "averaged", "body_path", "person_keypoints",
-    "smooth_size",
+    "LIMBS", "SIDED", "BodyPath", "PersonKeypoints", "averaged", "body_path", "from_hips",
+    "person_keypoints", "smooth_size",
 ]  # fmt: skip
 
 PERSON = Skeleton.preset("person14")
 # Neck and pelvis of detectors are midpoints of shoulders and hips, which motion capture has not.
 _TRUNK = ("neck", "pelvis")
+_HIPS = [PERSON.joint_names.index(f"{side}_hip") for side in ("left", "right")]
 LIMBS = [j for j, name in enumerate(PERSON.joint_names) if name not in _TRUNK]
 """Joints of arms and legs."""
 SIDED = (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"))
@@ -28,6 +29,15 @@ _CAPPED = 5.0  # largest cost of a step, in the same units
 _LENGTHS = {"elbow": 0.28, "wrist": 0.21, "knee": 0.42, "ankle": 0.41}  # bone lengths, metres
 _FILTERED = 5  # frames
 _SPREAD = 0.1  # of the logarithm of a frame's size
+
+
+def from_hips(positions: np.ndarray) -> np.ndarray:
+    """Return positions relative to the middle of the hips: ``(…, J, 3) → (…, J, 3)``.
+
+    Keypoints show the hips, not the pelvis.
+    """
+    relative: np.ndarray = positions - positions[..., _HIPS, :].mean(axis=-2, keepdims=True)
+    return relative
 
 
 class PersonKeypoints(NamedTuple):

@@ -10,6 +10,7 @@ import numpy as np
 from probmotion.comparison.results.stored_problems import StoredProblem
 from probmotion.geometry.cameras import Cameras
 from probmotion.lifting.checks import Check
+from probmotion.lifting.keypoints import from_hips
 from probmotion.motion.motion import Motion
 from probmotion.plots.animation import (
     CONTENT_POLICY,
@@ -60,8 +61,9 @@ def lift_page(
     """
     name = motion.name or "motion"
     step = max(1, -(-motion.frames // _FRAMES))
-    # Spread about a common root: the distance from the camera would hide that of the pose.
-    shown_draws = draws[:_DRAWS] - draws[:_DRAWS, :, :1] + motion.positions[None, :, :1]
+    # Spread about common hips: the distance from the camera would hide that of the pose.
+    place = motion.positions - from_hips(motion.positions)
+    shown_draws = from_hips(draws[:_DRAWS]) + place
     view = int(np.isfinite(keypoints).sum(axis=(1, 2, 3)).argmax())
     problem = StoredProblem(
         motion.skeleton, motion.fps, True, camera=cameras.view(view), keypoints=keypoints[view]

@@ -246,7 +246,8 @@ def _in_calibration(
             progress=settings.progress,
         )
     return Lift(
-        Motion(result.mean, PERSON, first.fps, name=first.name),
+        # Tracks of several views are named after their cameras.
+        Motion(result.mean, PERSON, first.fps, name=first.name if len(views) == 1 else ""),
         result.draws,
         calibration.cameras.views(found),
         tuple(view.name for view in views),

@@ -16,6 +16,7 @@ from probmotion.io.npz import write_npz
 from probmotion.io.smpl import smpl_motion
 from probmotion.lifting.camera import LevelCamera
 from probmotion.lifting.checks import Check
+from probmotion.lifting.keypoints import LIMBS, from_hips
 from probmotion.lifting.page import lift_page
 from probmotion.motion.inverse_kinematics import rigid_motion
 from probmotion.motion.motion import Motion
@@ -65,8 +66,8 @@ class Lift:
 
     @cached_property
     def sd(self) -> np.ndarray:
-        """Posterior standard deviation of positions relative to the root, (L, J, 3), metres."""
-        deviation: np.ndarray = (self.draws - self.draws[:, :, :1]).std(axis=0, ddof=1)
+        """Posterior standard deviation of positions relative to the hips, (L, J, 3), metres."""
+        deviation: np.ndarray = from_hips(self.draws).std(axis=0, ddof=1)
         return deviation
 
     @property
@@ -100,10 +101,10 @@ class Lift:
         trust = "A person who moves like those of the prior explains the keypoints."
         if failed:
             trust = f"Do not trust this motion: {'; '.join(failed)}."
-        spread = 1000 * np.sqrt((self.sd[:, 1:] ** 2).sum(axis=-1))
+        spread = 1000 * np.sqrt((self.sd[:, LIMBS] ** 2).sum(axis=-1))
         precision = (
             f"Joints have a standard deviation of {np.median(spread):.0f} mm relative to the "
-            f"pelvis (largest joint: {spread.mean(axis=0).max():.0f} mm), and keypoints a noise of "
+            f"hips (largest joint: {spread.mean(axis=0).max():.0f} mm), and keypoints a noise of "
             f"{self.noise:.1f} pixels."
         )
         return [trust, precision, self._filmed()]

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from probmotion.io.files import load
+from probmotion.lifting.keypoints import PERSON
 from probmotion.motion.skeleton import Skeleton
 
 
@@ -17,6 +18,10 @@ def test_a_lift_is_saved(lifted, tmp_path):
     with np.load(tmp_path / "lift.npz", allow_pickle=False) as archive:
         assert np.allclose(archive["draws"], lifted.draws)
         assert np.allclose(archive["sd"], lifted.sd)
+    # Relative to their middle, the hips mirror each other.
+    left, right = (PERSON.joint_names.index(f"{side}_hip") for side in ("left", "right"))
+    assert np.allclose(lifted.sd[:, left], lifted.sd[:, right])
+    assert lifted.sd[:, left].mean() < lifted.sd.mean()
     assert np.allclose(load(tmp_path / "lift.npz").positions, lifted.mean.positions)
     smpl = load(tmp_path / "lift.smpl22.npz")
     assert smpl.skeleton == Skeleton.preset("smpl22")
