@@ -11,7 +11,7 @@ import re
 import sys
 import types
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import field, fields, is_dataclass, make_dataclass
 from functools import partial
 from inspect import Parameter, signature
@@ -172,10 +172,11 @@ def object_from_text(text: str, kinds: Iterable[type]) -> Any:
     for other text.
     """
     known = {kind.__name__: kind for kind in kinds}
-    try:
-        built = _build(ast.parse(text.strip(), mode="eval").body, known)
-    except (SyntaxError, MemoryError, RecursionError):
-        built = None
+    built = None
+    # Python before 3.11.4 refuses null characters with ValueError.
+    with suppress(SyntaxError, MemoryError, RecursionError):
+        if "\0" not in text:
+            built = _build(ast.parse(text.strip(), mode="eval").body, known)
     if type(built) not in known.values():
         raise ValueError(
             f"setting must be one of {', '.join(known)}, with options such as Name(option=1), got "

@@ -394,6 +394,7 @@ def test_objects_are_read_from_text():
         ("Step(length=1)", "options of Step must be among size, inner, got 'length'"),
         ("Plain(kind='x')", "options of Plain must be among"),
         ("Step(", "must be one of"),
+        ("Step(\0)", "must be one of"),
         ("Step(size=__import__('os'))", "."),
         ("3", "must be one of"),
     ],
