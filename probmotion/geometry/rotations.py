@@ -274,8 +274,8 @@ def _cross_matrix(vector: Array) -> Array:
     xp = array_namespace(vector)
     x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
     zero = xp.zeros_like(x)
-    rows = ([zero, -z, y], [z, zero, -x], [-y, x, zero])
-    return xp.stack([xp.stack(list(row), axis=-1) for row in rows], axis=-2)
+    entries = xp.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1)
+    return xp.reshape(entries, (*x.shape, 3, 3))
 
 
 def _safe_sqrt(square: Array, excluded: Array) -> Array:

@@ -147,7 +147,11 @@ class AnnotatedPairs:
                 f"positions must be a NumPy array, got {type(positions).__name__}: the likelihood "
                 "is not differentiable"
             )
-        return self.evaluate(positions)[0]
+        check_shape("positions", positions, ("…", 1, self.n_joints, 3))
+        poses = np.asarray(positions, dtype=np.float64).reshape(-1, self.n_joints, 3)
+        projected = project_to_views(poses, self.views, self.skeleton)
+        log_terms = self.comparer.log_terms(projected, self.near, self.noise)
+        return self._mean(log_terms).reshape(positions.shape[:-3])
 
     def evaluate(
         self, positions: np.ndarray, generators: Sequence[np.random.Generator] | None = None
@@ -181,9 +185,12 @@ class AnnotatedPairs:
                 near = self.distribution.near(views, self.n_near)
                 results.append(self.comparer.nearest(projected, near))
             distances, closest = (np.concatenate(rows) for rows in zip(*results, strict=True))
-        log_terms = -0.5 * (distances / self.noise) ** 2
-        log_density = logsumexp(log_terms, axis=-1) - math.log(self.n_views)
+        log_density = self._mean(-0.5 * (distances / self.noise) ** 2)
         return log_density.reshape(batch), closest.reshape(*batch, self.n_views)
+
+    def _mean(self, log_terms: np.ndarray) -> np.ndarray:
+        """Return the log of the mean over views: ``(…, m) → (…)``."""
+        return logsumexp(log_terms, axis=-1) - math.log(self.n_views)
 
     def degenerate_fraction(self, positions: np.ndarray) -> float:
         """Return the fraction of projections of poses (n, 1, J, 3) with degenerate joints."""

@@ -42,6 +42,22 @@ def test_density_equals_equations_6_and_9(likelihood):
     assert np.allclose(likelihood.log_density(POSES), expected, atol=1e-8)
 
 
+@pytest.mark.parametrize("measure", ["interaction", "cartesian"])
+@pytest.mark.parametrize("occluded", [0.0, 0.3])
+def test_negligible_views_do_not_change_the_density(measure, occluded):
+    """The density omits views far below the best one; ``evaluate`` compares all of them."""
+    rng = np.random.default_rng(0)
+    visible = rng.random(ANNOTATIONS.visible.shape) >= occluded
+    annotations = replace(ANNOTATIONS, visible=visible)
+    likelihood = AnnotatedPairs(annotations, n_views=12, n_near=20, measure=measure)
+    poses = np.concatenate([POSES + s * rng.standard_normal(POSES.shape) for s in (0, 0.05, 0.5)])
+    log_density = likelihood.log_density(poses)
+    assert np.array_equal(log_density, likelihood.evaluate(poses)[0])
+    projections = project_to_views(poses[:, 0], likelihood.views, likelihood.skeleton)
+    terms = likelihood.comparer.log_terms(projections, likelihood.near, likelihood.noise)
+    assert (terms == -np.inf).any() == (measure == "interaction")
+
+
 def test_density_with_fixed_views_depends_on_the_seed_only():
     first, second, other = (AnnotatedPairs(ANNOTATIONS, seed=seed) for seed in (3, 3, 4))
     assert np.array_equal(first.views, second.views)

@@ -11,6 +11,10 @@ import numpy as np
 
 from probmotion.interaction.geometry.graph_kernels import graphs_of_visible, max_edges, write_graph
 from probmotion.interaction.geometry.graphs import GRAPHS, check_graph, joggle_offsets
+from probmotion.interaction.geometry.likelihood_kernels import (
+    log_terms_in_batch,
+    log_terms_on_threads,
+)
 from probmotion.interaction.geometry.nearest_kernels import (
     Prepared,
     all_distances,
@@ -110,11 +114,35 @@ class PairComparer:
         """
         projections = self._checked(projections, ("B", "V", self.n_joints, 2))
         candidates = self._checked_candidates(candidates, projections.shape[1])
-        # Avoid starting a thread pool for one thread: a process cannot fork after that.
-        serial = only_one_thread() or numba.get_num_threads() == 1
-        serial = serial or projections.shape[0] * projections.shape[1] < 2
+        serial = _serial(projections.shape[0] * projections.shape[1])
         kernel = nearest_in_batch if serial else nearest_in_batch_on_threads
         return kernel(projections, candidates, self.prepared)
+
+    def log_terms(
+        self, projections: np.ndarray, candidates: np.ndarray, noise: float
+    ) -> np.ndarray:
+        """Return −d²/2σ_l² for the distance d to the nearest candidate in each view (eq. 9).
+
+        Parameters
+        ----------
+        projections, candidates : ndarray, (B, V, J, 2) and (V, N)
+            As in :meth:`nearest`.
+        noise : float
+            Scale σ_l of the distances.
+
+        Returns
+        -------
+        log_terms : ndarray, (B, V)
+            −∞ for views that are negligible beside another view of the same pose-pair, in
+            addition to those without a distance.
+        """
+        if self.measure != "interaction":
+            distances, _ = self.nearest(projections, candidates)
+            return -0.5 * (distances / noise) ** 2
+        projections = self._checked(projections, ("B", "V", self.n_joints, 2))
+        candidates = self._checked_candidates(candidates, projections.shape[1])
+        kernel = log_terms_in_batch if _serial(len(projections)) else log_terms_on_threads
+        return kernel(projections, candidates, self.prepared, float(noise))
 
     def distances(self, projections: np.ndarray) -> np.ndarray:
         """Return the distances of projections, (B, J, 2) in metres, to all annotations, (B, n)."""
@@ -148,6 +176,14 @@ class PairComparer:
                 f"{candidates.min()} to {candidates.max()}"
             )
         return candidates.astype(np.int64, copy=False)
+
+
+def _serial(tasks: int) -> bool:
+    """Return whether to run tasks on the calling thread.
+
+    A thread pool for one thread is avoided because a process cannot fork after starting one.
+    """
+    return only_one_thread() or numba.get_num_threads() == 1 or tasks < 2
 
 
 def _prepare(

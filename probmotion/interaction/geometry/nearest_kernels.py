@@ -16,7 +16,7 @@ from probmotion.interaction.geometry.plane_contexts import context_cost, polar_b
 __all__ = [
     "INTERACTION", "Prepared", "all_distances", "annotation_graph_distance", "centred",
     "distances_to", "nearest_candidate", "nearest_in_batch", "nearest_in_batch_on_threads",
-    "prepare_projection",
+    "prepare_projection", "projection_sum", "residual", "rotation",
 ]  # fmt: skip
 
 INTERACTION, CARTESIAN, SHAPE_CONTEXT = range(3)  # indices into nearest.MEASURES
@@ -111,7 +111,7 @@ def nearest_candidate(
         square += joints[0, joint] ** 2 + joints[1, joint] ** 2
     for position in range(n_candidates):
         k = candidates[position]
-        turns[0, position], turns[1, position], product = _rotation(joints, prepared.joints[k])
+        turns[0, position], turns[1, position], product = rotation(joints, prepared.joints[k])
         n_visible = prepared.n_visible[k]
         visible_square = square * n_visible / n_joints
         left[position] = (visible_square + prepared.square[k] - 2.0 * product) / max(n_visible, 1)
@@ -134,7 +134,7 @@ def distances_to(
     difference, terms = np.empty_like(projection.joints), np.empty(projection.edges.shape[1])
     for position in range(len(candidates)):
         k = candidates[position]
-        cosine, sine, _ = _rotation(projection.joints, prepared.joints[k])
+        cosine, sine, _ = rotation(projection.joints, prepared.joints[k])
         distance = _distance(projection, k, cosine, sine, prepared, np.inf, difference, terms)
         distances[position] = distance
 
@@ -144,8 +144,8 @@ def annotation_graph_distance(
     joints: np.ndarray, k: int, prepared: Prepared, difference: np.ndarray, terms: np.ndarray
 ) -> float:
     """Return the dissimilarity (eq. 8) with annotation k's graph also used for the projection."""
-    cosine, sine, _ = _rotation(joints, prepared.joints[k])
-    _residual(joints, prepared.joints[k], cosine, sine, difference)
+    cosine, sine, _ = rotation(joints, prepared.joints[k])
+    residual(joints, prepared.joints[k], cosine, sine, difference)
     return 2.0 * _annotation_sum(difference, k, prepared, terms)
 
 
@@ -189,7 +189,7 @@ def prepare_projection(points: np.ndarray, prepared: Prepared) -> Projection:
 
 
 @numba.njit(cache=True)
-def _rotation(source: np.ndarray, target: np.ndarray) -> tuple[float, float, float]:
+def rotation(source: np.ndarray, target: np.ndarray) -> tuple[float, float, float]:
     """Return the cosine and sine of the least-squares rotation and Σ target · (rotated source).
 
     ``target`` must be centred and 0 where occluded; ``source`` need not be centred.
@@ -220,18 +220,18 @@ def _distance(
     if prepared.measure == SHAPE_CONTEXT:
         angle, contexts = np.arctan2(sine, cosine), prepared.contexts[k]
         return context_cost(projection.bins, angle, seen, contexts, prepared.shared, best)
-    _residual(projection.joints, prepared.joints[k], cosine, sine, difference)
+    residual(projection.joints, prepared.joints[k], cosine, sine, difference)
     if prepared.measure == CARTESIAN:
         return _root_mean_square(difference, seen, prepared.n_visible[k])
     occluded = prepared.n_visible[k] < projection.joints.shape[1]
-    total = _projection_sum(difference, projection, occluded, seen, terms)
+    total = projection_sum(difference, projection, occluded, seen, terms)
     if total > best or prepared.edge_start[k] == prepared.edge_start[k + 1]:
         return np.inf
     return total + _annotation_sum(difference, k, prepared, terms)
 
 
 @numba.njit(cache=True)
-def _residual(
+def residual(
     joints: np.ndarray, target: np.ndarray, cosine: float, sine: float, difference: np.ndarray
 ) -> None:
     """Write the difference of the rotated projection and an annotation."""
@@ -253,7 +253,7 @@ def _annotation_sum(difference: np.ndarray, k: int, prepared: Prepared, terms: n
 
 
 @numba.njit(cache=True)
-def _projection_sum(
+def projection_sum(
     difference: np.ndarray,
     projection: Projection,
     occluded: bool,
