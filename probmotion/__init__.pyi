@@ -30,3 +30,4 @@ from .posteriors.likelihoods import Joints3D as Joints3D, Keypoints2D as Keypoin
 from .posteriors.noise_schedule import NoiseSchedule as NoiseSchedule
 from .posteriors.posterior import MotionPosterior as MotionPosterior
 from .posteriors.sampling import Sampler as Sampler, UnsupportedPosterior as UnsupportedPosterior
+from .posteriors.streams import open_draws as open_draws

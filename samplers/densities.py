@@ -15,7 +15,7 @@ from probmotion.posteriors.sampling import Sampler, UnsupportedPosterior, batche
 from probmotion.seeds import NormalStreams
 from probmotion.validation import check_count, check_finite, check_shape
 
-__all__ = ["Density", "continued", "motions", "not_conjugate", "starting_points"]
+__all__ = ["Density", "check_same_run", "continued", "motions", "not_conjugate", "starting_points"]
 
 
 class Density:
@@ -152,19 +152,7 @@ def continued(
     check_count("chains", chains)
     if not isinstance(initial, MotionDraws):
         return None
-    attributes = initial.dataset.attrs
-    settings = settings_of(sampler)
-    for name, value, earlier in (
-        ("sampler", sampler.name, attributes["sampler"]),
-        ("settings", settings, json.loads(attributes["settings"])),
-        ("seed", seed, int(attributes["seed"])),
-        ("chains", chains, initial.dataset.sizes["chain"]),
-    ):
-        if value != earlier:
-            raise ValueError(
-                f"{name} must be {earlier}, as in the run to be continued, got {value}; to start a "
-                "new run at its end, pass an array of points"
-            )
+    check_same_run(sampler, initial, chains, seed)
     last = initial.dataset.isel(draw=-1)
     # If densities are estimated, the state contains deterministic densities for comparison.
     stored = initial.state.get("fixed", last["log_density"].values)
@@ -175,6 +163,23 @@ def continued(
             f"{stored[0]:.6g} instead of {recomputed[0]:.6g}"
         )
     return initial.state
+
+
+def check_same_run(sampler: Sampler, initial: MotionDraws, chains: int, seed: int) -> None:
+    """Raise ``ValueError`` unless ``initial`` has this sampler, seed and number of chains."""
+    attributes = initial.dataset.attrs
+    settings = settings_of(sampler)
+    for name, value, earlier in (
+        ("sampler", sampler.name, attributes["sampler"]),
+        ("settings", settings, json.loads(attributes["settings"])),
+        ("seed", seed, int(attributes["seed"])),
+        ("chains", chains, initial.dataset.sizes["chain"]),
+    ):
+        if value != earlier:
+            raise ValueError(
+                f"{name} must be {earlier}, as in the run to be continued, got {value}; start a "
+                "new run to change it"
+            )
 
 
 def motions(posterior: MotionPosterior, theta: np.ndarray, seed: int, first: int) -> np.ndarray:

@@ -15,6 +15,7 @@ from probmotion.arrays import to_numpy
 from probmotion.posteriors.draws import MotionDraws
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.sampling import Interrupted, batches, progress_bar, require
+from probmotion.samplers.densities import check_same_run
 from probmotion.seeds import NormalStreams
 from probmotion.threads import one_thread
 from probmotion.validation import check_count
@@ -58,7 +59,9 @@ class IndependentSampler:
         initial: MotionDraws | np.ndarray | None = None,
         progress: bool = True,
     ) -> MotionDraws:
-        """Return ``chains`` × ``draws`` independent draws; ``initial`` must be ``None``.
+        """Return ``chains`` × ``draws`` independent draws.
+
+        ``initial`` is an earlier run to continue: draws have the numbers that follow its own.
 
         Raises
         ------
@@ -70,17 +73,22 @@ class IndependentSampler:
             On Ctrl-C, with the finished draws.
         """
         require(self, posterior)
-        if initial is not None:
-            raise ValueError(
-                f"initial must be None, got {type(initial).__name__}: {self.name} has no starting "
-                "points"
-            )
-        source = self._batches(posterior, seed, progress)
         check_count("draws", draws)
         check_count("chains", chains)
+        first = 0
+        if isinstance(initial, MotionDraws):
+            check_same_run(self, initial, chains, seed)
+            first = int(initial.state["draws"])
+        elif initial is not None:
+            raise ValueError(
+                f"initial must be None or an earlier run, got {type(initial).__name__}: "
+                f"{self.name} has no starting points"
+            )
+        source = self._batches(posterior, seed, progress)
         start = time.perf_counter()
         # Order by draw, so that an interrupted run has the same number of draws in every chain.
-        pairs = [(chain, draw) for draw in range(draws) for chain in range(chains)]
+        numbers = range(first, first + draws)
+        pairs = [(chain, draw) for draw in numbers for chain in range(chains)]
         done: list[np.ndarray] = []
         spent = dict(source.counts)
 
@@ -94,6 +102,7 @@ class IndependentSampler:
                 seed=seed,
                 seconds=time.perf_counter() - start,
                 counts=spent,
+                state={"draws": np.array(first + len(motions) // chains)},
                 independent=True,
             )
             thetas = source.thetas

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from probmotion.posteriors.finished import FinishedDraws
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.problem import Problem
 from probmotion.posteriors.protocols import Likelihood, MotionPrior
+from probmotion.posteriors.streams import stream_draws
 from probmotion.problems.catalogue import load_problem
 from probmotion.threads import one_thread
 from probmotion.validation import check_count, check_shape
@@ -25,6 +27,7 @@ from probmotion.validation import check_count, check_shape
 __all__ = ["Score", "posterior", "problem", "sample", "score"]
 
 _MIN_DRAWS = 5
+_MAX_SCORED = 20_000
 
 
 def problem(name: str, **sizes: Any) -> Problem:
@@ -51,6 +54,7 @@ def sample(
     chains: int = 4,
     seed: int = 0,
     progress: bool = True,
+    stream: str | Path | None = None,
     **settings: Any,
 ) -> MotionDraws:
     """Return draws from a posterior.
@@ -69,6 +73,10 @@ def sample(
         Seed of all random numbers.
     progress : bool
         Show a progress bar.
+    stream : str or Path, optional
+        Folder to which draws are written as they come, so that memory does not grow. An unfinished
+        run in it is continued with the same draws. The result reads draws when they are used; see
+        :func:`~probmotion.open_draws`.
     **settings
         Settings of the sampler that differ from its defaults.
 
@@ -89,9 +97,10 @@ def sample(
         except TypeError as error:
             raise ValueError(f"settings must be those of {used.name}, got {error}") from error
     chosen = _problem(target)
-    return used.sample(
-        chosen.posterior, draws=draws // chains, chains=chains, seed=seed, progress=progress
-    )
+    options: dict[str, Any] = {"draws": draws // chains, "chains": chains, "seed": seed}
+    if stream is not None:
+        return stream_draws(used, chosen.posterior, stream, progress=progress, **options)
+    return used.sample(chosen.posterior, progress=progress, **options)
 
 
 @dataclass(frozen=True)
@@ -135,7 +144,8 @@ def score(target: AnyProblem, draws: Any, *, seed: int = 0) -> Score:
     target : str, Problem or MotionPosterior
         Posterior that was sampled, its problem, or the name of a problem.
     draws : MotionDraws, xarray.DataTree or array
-        At least five draws; see :meth:`probmotion.posteriors.FinishedDraws.of`.
+        At least five draws; see :meth:`probmotion.posteriors.FinishedDraws.of`. Chains of
+        :class:`~probmotion.MotionDraws` are thinned to 20 000 draws in all.
     seed : int
         Seed of reference draws.
 
@@ -147,6 +157,8 @@ def score(target: AnyProblem, draws: Any, *, seed: int = 0) -> Score:
     from probmotion.metrics.measures import measure
 
     chosen = _problem(target)
+    if isinstance(draws, MotionDraws):
+        draws = _thinned(draws)
     finished = FinishedDraws.of(draws)
     known = draws if isinstance(draws, MotionDraws) else finished.sample(chosen.posterior)
     _check_draws(known.flat(), chosen)
@@ -165,6 +177,13 @@ def _check_draws(motions: np.ndarray, chosen: Problem) -> None:
         raise ValueError(f"draws must contain at least {_MIN_DRAWS}, got {len(motions)}")
     posterior = chosen.posterior
     check_shape("draws", motions, ("n", posterior.frames, posterior.skeleton.n_joints, 3))
+
+
+def _thinned(draws: MotionDraws) -> MotionDraws:
+    """Return at most 20 000 evenly spaced draws; the others are not read."""
+    n = draws.dataset.sizes["chain"] * draws.dataset.sizes["draw"]
+    step = -(-n // _MAX_SCORED)
+    return replace(draws, dataset=draws.dataset.isel(draw=slice(None, None, step)))
 
 
 def _problem(target: AnyProblem) -> Problem:

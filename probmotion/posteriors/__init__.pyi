@@ -37,4 +37,5 @@ from .sampling import (
     require as require,
     sampler_names as sampler_names,
 )
+from .streams import open_draws as open_draws, stream_draws as stream_draws
 from .truncation import TruncatedPosterior as TruncatedPosterior

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, is_dataclass
 from functools import cache
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -172,7 +173,7 @@ class MotionDraws:
 
     @property
     def state(self) -> dict[str, np.ndarray]:
-        """Sampler state from which the run can be continued; empty for independent draws."""
+        """Sampler state from which the run can be continued."""
         state = _with_prefix("state_", self.dataset.data_vars)
         return {name: values.values for name, values in state.items()}
 
@@ -296,7 +297,11 @@ def settings_of(sampler: Any) -> dict[str, Any]:
 
 @cache
 def library_versions() -> dict[str, str]:
-    """Return the versions of the packages that draws and their metrics depend on."""
-    samplers = ("probmotion", "numpy", "scipy", "jax", "numpyro", "emcee", "torch")
-    packages = (*samplers, "arviz-stats", "scikit-learn")
-    return {package: version(package) for package in packages}
+    """Return the versions of the installed packages that draws and their metrics depend on."""
+    samplers = ("probmotion", "numpy", "scipy", "numba", "jax", "numpyro", "emcee", "torch")
+    versions = {}
+    for package in (*samplers, "arviz-stats"):
+        # Without its extra, a package is not installed.
+        with suppress(PackageNotFoundError):
+            versions[package] = version(package)
+    return versions

@@ -1,0 +1,182 @@
+"""Draws written as they come: equal to those of one run, whatever interrupts the writing."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+import probmotion as pm
+from probmotion.posteriors import streams
+from probmotion.posteriors.sampling import Interrupted
+
+SAMPLERS = {
+    "mh": pm.samplers.MetropolisHastings(warmup=20, thin=1),
+    "smc": pm.samplers.SequentialMonteCarlo(particles=20, candidates=40, thin=1, gradients=False),
+    "ancestral3d": pm.samplers.Ancestral3D(steps=5, batch=4),
+}
+RUN = {"draws": 40, "chains": 2, "seed": 3, "progress": False}
+
+
+@pytest.fixture(scope="module")
+def posterior():
+    return pm.problem("gait-monocular", frames=6).posterior
+
+
+@pytest.fixture(autouse=True)
+def small_blocks(monkeypatch):
+    """Let a run of 40 draws have several blocks, the last of them incomplete."""
+    monkeypatch.setattr(streams, "_BLOCK_BYTES", 80_000)
+
+
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_streamed_draws_equal_those_of_one_run(name, posterior, tmp_path):
+    sampler = SAMPLERS[name]
+    assert 1 < 40 / streams._block(posterior, 2) != 40 // streams._block(posterior, 2)
+    streams.stream_draws(sampler, posterior, tmp_path, **{**RUN, "draws": 25})
+    streamed = streams.stream_draws(sampler, posterior, tmp_path, **RUN)
+    once = sampler.sample(posterior, **RUN)
+    tolerance = 1e-9 if once.independent else 0  # rounding depends on the batch
+    for key, values in once.dataset.data_vars.items():
+        if values.dims[:2] == ("chain", "draw"):
+            np.testing.assert_allclose(streamed.dataset[key], values, rtol=0, atol=tolerance)
+    assert streamed.counts == once.counts
+    assert streamed.skeleton == once.skeleton
+    again = streams.stream_draws(sampler, posterior, tmp_path, **{**RUN, "draws": 10})
+    np.testing.assert_array_equal(again.positions, streamed.positions[:, :10])
+
+
+def test_draws_are_read_when_they_are_used(posterior, tmp_path):
+    pm.sample(posterior, SAMPLERS["mh"], draws=80, chains=2, stream=tmp_path, progress=False)
+    draws = pm.open_draws(tmp_path)
+    tree = draws.to_arviz()
+    assert not any(draws.dataset[name]._in_memory for name in ("positions", "theta"))
+    assert tree["posterior"]["theta"].sizes["draw"] == 40
+    score = pm.score("gait-monocular", pm.sample("gait-monocular", draws=40, stream=tmp_path / "a"))
+    assert score.verdict is not None
+
+
+def _stream_in_a_process(folder, draws):
+    code = (
+        "import probmotion as pm\n"
+        "from probmotion.posteriors import streams\n"
+        "streams._BLOCK_BYTES = 80_000\n"
+        "posterior = pm.problem('gait-monocular', frames=6).posterior\n"
+        "sampler = pm.samplers.MetropolisHastings(warmup=20, thin=1)\n"
+        "print('ready', flush=True)\n"
+        f"streams.stream_draws(sampler, posterior, {str(folder)!r}, draws={draws}, chains=2, "
+        "seed=3, progress=False)\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
+    assert process.stdout.readline() == b"ready\n"
+    return process
+
+
+def _stored(folder):
+    if not (folder / "last.nc").exists():
+        return 0
+    return pm.open_draws(folder).positions.sizes["draw"]
+
+
+def test_a_killed_run_continues_with_the_same_draws(posterior, tmp_path):
+    moments, survived = random.Random(0), 0
+    for number in range(4):
+        with _stream_in_a_process(tmp_path, 4000) as process:
+            # The first is killed in its first block, the others after more blocks.
+            while number > 0 and _stored(tmp_path) == survived:
+                time.sleep(0.01)
+            time.sleep(moments.uniform(0.01, 0.3))
+            process.send_signal(signal.SIGKILL)
+        assert _stored(tmp_path) >= survived
+        survived = _stored(tmp_path)
+    assert 0 < survived < 4000
+    assert np.isfinite(pm.open_draws(tmp_path).positions.values).all()
+    draws = survived + 30
+    resumed = streams.stream_draws(SAMPLERS["mh"], posterior, tmp_path, **{**RUN, "draws": draws})
+    once = SAMPLERS["mh"].sample(posterior, **{**RUN, "draws": draws})
+    np.testing.assert_array_equal(resumed.positions, once.positions)
+    np.testing.assert_array_equal(resumed.dataset["theta"], once.dataset["theta"])
+    assert not list(tmp_path.rglob("*.partial"))
+
+
+def test_ctrl_c_stores_the_finished_draws(posterior, tmp_path, monkeypatch):
+    sampler, calls = SAMPLERS["ancestral3d"], []
+    original = type(sampler)._batches
+
+    def interrupted(self, *arguments):
+        source = original(self, *arguments)
+        draw = source.draw
+
+        def stop(streams, tick):
+            calls.append(1)
+            if len(calls) == 4:
+                raise KeyboardInterrupt
+            return draw(streams, tick)
+
+        source.draw = stop
+        return source
+
+    monkeypatch.setattr(type(sampler), "_batches", interrupted)
+    with pytest.raises(Interrupted) as caught:
+        streams.stream_draws(sampler, posterior, tmp_path, **RUN)
+    finished = caught.value.draws.positions
+    assert 0 < finished.sizes["draw"] < 40
+    resumed = streams.stream_draws(sampler, posterior, tmp_path, **RUN).positions
+    np.testing.assert_array_equal(resumed[:, : finished.sizes["draw"]], finished)
+    np.testing.assert_allclose(resumed, sampler.sample(posterior, **RUN).positions, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "message"),
+    [
+        ("mh", {"seed": 4}, "seed must be 3, as in the run to be continued, got 4"),
+        ("mh", {"chains": 3}, r"stream must have draws of \(3, 6, 17\) chains, frames and joints"),
+        ("smc", {}, "sampler must be mh, as in the run to be continued, got smc"),
+    ],
+)
+def test_another_run_is_refused(name, changes, message, posterior, tmp_path):
+    streams.stream_draws(SAMPLERS["mh"], posterior, tmp_path, **{**RUN, "draws": 5})
+    with pytest.raises(ValueError, match=message):
+        streams.stream_draws(SAMPLERS[name], posterior, tmp_path, **RUN | changes)
+
+
+@pytest.mark.parametrize("name", ["mh", "ancestral3d"])
+def test_another_posterior_is_refused(name, posterior, tmp_path):
+    streams.stream_draws(SAMPLERS[name], posterior, tmp_path, **{**RUN, "draws": 5})
+    other = pm.problem("gait-occluded", frames=6).posterior
+    with pytest.raises(ValueError, match=r"must (be a run|have draws) of the same posterior"):
+        streams.stream_draws(SAMPLERS[name], other, tmp_path, **RUN)
+
+
+def test_folders_in_use_and_other_folders_are_refused(posterior, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(ValueError, match="stream must be a new folder or one of a run"):
+        streams.stream_draws(SAMPLERS["mh"], posterior, tmp_path, **RUN)
+    with pytest.raises(FileNotFoundError, match="path must be a folder with complete draws"):
+        pm.open_draws(tmp_path)
+    (tmp_path / "notes.txt").unlink()
+    with (
+        streams._locked(tmp_path),
+        pytest.raises(ValueError, match="to which another process writes"),
+    ):
+        streams.stream_draws(SAMPLERS["mh"], posterior, tmp_path, **RUN)
+
+
+def test_damaged_draws_are_not_believed(posterior, tmp_path):
+    streams.stream_draws(SAMPLERS["mh"], posterior, tmp_path, **RUN)
+    chunks = [path for path in (tmp_path / "draws.zarr" / "theta").iterdir() if path.name[0] != "."]
+    for path in chunks:
+        content = bytearray(path.read_bytes())
+        content[len(content) // 2] ^= 4
+        path.write_bytes(content)
+    with pytest.raises(RuntimeError, match="checksum do not match"):
+        pm.open_draws(tmp_path).dataset["theta"].load()
+    os.truncate(tmp_path / "last.nc", 200)
+    with pytest.raises(ValueError, match="path must be a netCDF file of draws"):
+        pm.open_draws(tmp_path)
