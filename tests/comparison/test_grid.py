@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import re
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -90,23 +89,6 @@ def test_results_are_identical_in_processes_and_threads(grid, samplers, tmp_path
         )
 
 
-# Dask has its own event loop and connections.
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::ResourceWarning")
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_results_are_identical_with_dask(grid, samplers, tmp_path):
-    distributed = pytest.importorskip("distributed")
-    cluster = distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=logging.CRITICAL
-    )
-    with cluster, distributed.Client(cluster) as client, client.get_executor() as executor:
-        assert len(set(client.run(os.getpid).values()) - {os.getpid()}) == 2
-        settings = {**SMALL, "seeds": 2, "executor": executor, "out": tmp_path}
-        comparison = compare([generation(), monocular()], samplers, **settings)
-    assert numbers(comparison.table()) == numbers(grid.table())
-
-
 def test_registered_problems_and_budgets_give_identical_results_in_a_worker(capsys):
     settings = {**SMALL, "budget": Budget(evaluations=500), "time_limit": 100.0}
     here = compare("gait(frames=4)", Walking(), **settings | {"progress": True})
@@ -114,6 +96,13 @@ def test_registered_problems_and_budgets_give_identical_results_in_a_worker(caps
     there = compare("gait(frames=4)", Walking(), **settings | {"workers": 1})
     assert numbers(here.table()) == numbers(there.table())
     assert here.results[0].budget == there.results[0].budget
+
+
+@pytest.mark.parametrize("library", ["torch", "jax", None])
+def test_a_note_says_that_no_library_computes_gradients(library):
+    versions = {"numpy": "2", **({library: "1"} if library else {})}
+    plan = Plan(problems={}, samplers={}, draws=1, chains=1, seeds=1, versions=versions)
+    assert any("KSD² is not measured" in note for note in plan.notes) == (library is None)
 
 
 def test_notes_name_the_source_of_long_run_references(tmp_path):

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from probmotion.comparison.results import GridResults
-from probmotion.comparison.results.failures import Failure
+from probmotion.comparison.results.failures import NOT_INSTALLED, Failure
 from probmotion.comparison.results.run_results import RunResult
 from probmotion.comparison.results.summary import problem_sentence, summary
 from probmotion.metrics.verdict import Verdict
@@ -155,6 +155,18 @@ def test_failures_are_one_line_each_and_refusals_are_not_failures():
     assert lines[-3] == "mine0 on p: no such key 0"
     assert "and 2 more failures, see failures.json" in lines
     assert not any(" on p: needs 9 seconds" in line for line in lines)
+
+
+def test_missing_libraries_are_named_once_for_all_problems():
+    missing = Failure(
+        NOT_INSTALLED, "jax must be installed; run pip install 'probmotion[jax]'", False
+    )
+    row = {"exact": RIGHT, "nuts": missing, "smc": missing}
+    lines = summary(Results({"p": row, "q": row})).splitlines()
+    assert (
+        lines.count("nuts and smc: jax must be installed; run pip install 'probmotion[jax]'") == 1
+    )
+    assert "failed (not installed)" in "".join(lines)
 
 
 def test_comparison_prints_its_summary_and_writes_the_long_table(grid):

@@ -78,6 +78,7 @@ class OutOfMemoryError(RuntimeError):
         (WorkerDied(killed=False), "died"),
         (FloatingPointError("overflow"), "nan"),
         (ValueError("theta is wrong"), "ValueError"),
+        (ModuleNotFoundError("jax must be installed"), "not installed"),
         (TimeLimitExceeded(3.0), "time"),
         (ResultNotWritten("the disk is full"), "ResultNotWritten"),
     ],
@@ -157,10 +158,10 @@ for call in (load_libraries, lambda: measure(problem, draws, 0)):
     call()
     modules.append(set(sys.modules))
 heavy = [{name.partition(".")[0] for name in new - old} for old, new in zip(modules, modules[1:])]
-print([sorted({"arviz_stats", "scipy", "sklearn"} & names) for names in heavy])
+print([sorted({"arviz_stats", "scipy"} & names) for names in heavy])
 """
     loaded, later = ast.literal_eval(finish(start("-c", program))[0])
-    assert {"arviz_stats", "sklearn"} <= set(loaded)
+    assert "arviz_stats" in loaded
     assert later == []
 
 

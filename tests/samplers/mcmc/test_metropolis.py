@@ -31,7 +31,7 @@ def test_chains_start_at_initial(run):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"seed": 4}, "seed must be 3, as in the run to be continued, got 4; to start a new run"),
+        ({"seed": 4}, "seed must be 3, as in the run to be continued, got 4; start a new run"),
         ({"chains": 3}, "chains must be 2, as in the run to be continued, got 3"),
         ({"to": replace(QUICK, thin=4)}, "settings must be .*, as in the run .*'thin': 4"),
         ({"of": "exact"}, "sampler must be exact, as in the run to be continued, got mh"),
