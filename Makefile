@@ -21,8 +21,10 @@ demo: install
 	@$(BIN)/probmotion lift notebooks/keypoints/walk.json --image-size 1000 1000 --out demo/lift
 	@$(BIN)/probmotion show demo/lift/lift.npz --figure demo/lift.png
 
+# tests/test_extras.py runs tests/core, without the optional libraries.
 test: install
-	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m 'not slow' -n 2 --dist worksteal tests
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m 'not slow' -n 2 --dist worksteal \
+		--ignore tests/core tests
 
 slow: install
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m slow -n 2 --dist worksteal tests

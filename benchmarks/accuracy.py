@@ -394,10 +394,16 @@ def main() -> None:
     commands.add_parser("diffusion", help="Diffusion samplers against exact posteriors.")
     command = commands.add_parser("lift", help="Lifts of made videos of held-out clips.")
     command.add_argument("--data", required=True, help="Folder with the real motions.")
+    command.add_argument(
+        "--lifter",
+        type=Path,
+        help="Folder of the unsupervised lifter, which is trained there (minutes) if it is absent; "
+        "by default, lifts are not compared with it.",
+    )
     commands.add_parser("mixing", help="Samplers of many modes within budgets.")
     options = parser.parse_args()
     if options.command == "lift":
-        for name, value in lift_figures(Path(options.data)):
+        for name, value in lift_figures(Path(options.data), options.lifter):
             print(f"{name}: {value:.4g}", flush=True)
         return
     if options.command in ("diffusion", "mixing"):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from single_pose_baseline import single_poses
+from unsupervised_baseline import trained_lifter, unsupervised
 
 from probmotion.data.denoising_clips import denoising_clips
 from probmotion.data.synthetic.gaits import make_gait
@@ -28,14 +29,18 @@ MADE = 15  # videos of each kind that must be flagged
 COMPARED = 3  # frames of each video that the baseline lifts
 
 
-def lift_figures(folder: Path) -> Iterator[tuple[str, float]]:
+def lift_figures(folder: Path, lifter_folder: Path | None = None) -> Iterator[tuple[str, float]]:
     """Yield the figures; medians over videos, coverages are means.
 
     ``lift_all_over_single_pose`` is the ratio of the median errors of the lift and of single poses
     lifted by joint limits (:mod:`single_pose_baseline`), in the same frames of the same videos.
+    ``lift_all_over_unsupervised`` is that to the unsupervised lifter in ``lifter_folder``
+    (:mod:`unsupervised_baseline`), in all frames, with estimated or known distance and pitch.
     """
+    lifter = None if lifter_folder is None else trained_lifter(folder, lifter_folder)
     rows: dict[str, list[tuple[float, float, float]]] = {"walk": [], "other": []}
     compared: dict[str, list[list[float]]] = {"walk": [], "other": []}
+    baseline: dict[str, list[list[float]]] = {"walk": [], "other": []}
     flagged = []
     for number, clip in enumerate(held_out(folder)):
         for view in range(VIEWS):
@@ -48,6 +53,10 @@ def lift_figures(folder: Path) -> Iterator[tuple[str, float]]:
             if rows[kind][-1][0] <= GOOD:
                 flagged.append(not result.trusted)
             compared[kind].append(beside_single_poses(result, video, HEIGHTS[view % 2]))
+            if lifter is not None:
+                truth = about_hips(video.motion.positions)
+                distances = np.linalg.norm(unsupervised(video, lifter) - truth, axis=-1)
+                baseline[kind].append((1000 * distances.mean(axis=(1, 2))).tolist())
     walk, every = (np.array(rows["walk"]), np.array(rows["walk"] + rows["other"]))
     yield "lift_walk_mpjpe_mm", float(np.median(walk[:, 0]))
     yield "lift_all_mpjpe_mm", float(np.median(every[:, 0]))
@@ -60,6 +69,15 @@ def lift_figures(folder: Path) -> Iterator[tuple[str, float]]:
         yield f"lift_{name}_single_pose_mpjpe_mm", single
         yield f"lift_{name}_over_single_pose", lifts / single
         yield f"lift_{name}_over_single_pose_known_direction", lifts / directed
+    if lifter is not None:
+        for name, lifts, values in (
+            ("walk", walk, baseline["walk"]),
+            ("all", every, baseline["walk"] + baseline["other"]),
+        ):
+            blind, told = np.median(values, axis=0)
+            yield f"lift_{name}_unsupervised_mpjpe_mm", blind
+            yield f"lift_{name}_over_unsupervised", np.median(lifts[:, 0]) / blind
+            yield f"lift_{name}_over_unsupervised_known_distance", np.median(lifts[:, 0]) / told
     bad = bad_videos(folder)
     marks = {kind: [not lifted(video).trusted for video in videos] for kind, videos in bad.items()}
     for kind, values in marks.items():

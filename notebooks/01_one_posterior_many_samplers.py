@@ -28,7 +28,7 @@
 # p(X) = \sum_k w_k\, \mathcal{N}(X; \mu_k, W_k W_k^\top + \sigma^2 I).
 # $$
 #
-# On Colab, first run `%pip install git+https://github.com/probmotion/probmotion`.
+# On Colab, first run `%pip install 'probmotion[all] @ git+https://github.com/probmotion/probmotion'`.
 
 # %%
 from pathlib import Path

@@ -29,7 +29,7 @@
 # with the prior $p(x)$ of physically possible poses, annotations $a$, views $v_i$ and the distance $d_{IC}$ in
 # interaction coordinates.
 #
-# On Colab, first run `%pip install git+https://github.com/probmotion/probmotion`.
+# On Colab, first run `%pip install 'probmotion[all] @ git+https://github.com/probmotion/probmotion'`.
 
 # %%
 from pathlib import Path

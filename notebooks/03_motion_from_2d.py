@@ -27,7 +27,7 @@
 # This notebook trains a diffusion model on 2D tracks, samples 3D motion and evaluates it. All networks are tiny,
 # so that it takes two minutes on one core; `notebooks/ablations/mas.py` is the full study.
 #
-# On Colab, first run `%pip install git+https://github.com/probmotion/probmotion`.
+# On Colab, first run `%pip install 'probmotion[all] @ git+https://github.com/probmotion/probmotion'`.
 
 # %%
 from pathlib import Path

@@ -30,7 +30,7 @@
 # added to it so that errors can be measured. Otherwise a held-out CMU clip is used if available, else a synthetic
 # walk of a body that the prior has not seen.
 #
-# On Colab, first run `%pip install git+https://github.com/probmotion/probmotion`.
+# On Colab, first run `%pip install 'probmotion[all] @ git+https://github.com/probmotion/probmotion'`.
 
 # %%
 from pathlib import Path

@@ -28,7 +28,7 @@
 # The package includes the prior `animal-vae`, trained on dogs and on synthetic quadrupeds that walk, trot, pace,
 # canter and spin.
 #
-# On Colab, first run `%pip install git+https://github.com/probmotion/probmotion`.
+# On Colab, first run `%pip install 'probmotion[all] @ git+https://github.com/probmotion/probmotion'`.
 
 # %%
 from dataclasses import replace

@@ -19,7 +19,7 @@
 # Samplers are compared on problems with known posteriors and equal budgets, their uncertainty is checked by
 # simulation-based calibration, and the error of one of them is decomposed into parts.
 #
-# On Colab, first run `%pip install git+https://github.com/probmotion/probmotion`.
+# On Colab, first run `%pip install 'probmotion[all] @ git+https://github.com/probmotion/probmotion'`.
 
 # %%
 from pathlib import Path

@@ -23,7 +23,7 @@
 #
 # Where does it fail? Section 3 measures that on motion unlike the training clips.
 #
-# On Colab, first run `%pip install git+https://github.com/probmotion/probmotion`.
+# On Colab, first run `%pip install 'probmotion[all] @ git+https://github.com/probmotion/probmotion'`.
 
 # %%
 import os

@@ -24,7 +24,7 @@
 #
 #     probmotion lift keypoints.json --fps 30 --image-size 1920 1080 --out dance
 #
-# On Colab, first run `%pip install git+https://github.com/probmotion/probmotion`.
+# On Colab, first run `%pip install 'probmotion[all] @ git+https://github.com/probmotion/probmotion'`.
 
 # %%
 import matplotlib.pyplot as plt

@@ -17,6 +17,7 @@ from .io.files import (
     save as save,
 )
 from .io.keypoints.files import read_keypoints as read_keypoints
+from .lifting.pairs import LiftedPairs as LiftedPairs, lift_pairs as lift_pairs
 from .lifting.recording_lift import lift as lift
 from .lifting.result import Lift as Lift
 from .motion.motion import (

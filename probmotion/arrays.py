@@ -47,8 +47,7 @@ def jax_from_torch(function: Callable[[Array], Array]) -> Callable[[Array], Arra
     The result supports jit, vmap and first-order gradients. Each call evaluates value and gradient
     with torch's autograd through ``jax.pure_callback``.
     """
-    import jax
-    import torch
+    from probmotion.extras import jax, torch
 
     # XLA runs callbacks on its own thread, outside the caller's ``jax.enable_x64``, and would round
     # to float32. float64 numbers are therefore passed as pairs of 32-bit words.

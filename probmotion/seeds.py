@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 if TYPE_CHECKING:
-    import torch
+    from probmotion.extras import torch
 
 __all__ = [
     "NormalStreams", "RandomNumbers", "generator", "integer", "jax_key", "resumed_generator",
@@ -87,14 +87,14 @@ def integer(seed: int, *path: Name) -> int:
 
 def torch_generator(seed: int, *path: Name, device: str = "cpu") -> torch.Generator:
     """Return the torch generator for ``seed`` and ``path``."""
-    import torch
+    from probmotion.extras import torch
 
     return torch.Generator(device=device).manual_seed(integer(seed, *path))
 
 
 def jax_key(seed: int, *path: Name) -> Any:
     """Return the JAX key for ``seed`` and ``path``."""
-    import jax
+    from probmotion.extras import jax
 
     return jax.random.key(integer(seed, *path) & 0xFFFFFFFF)
 

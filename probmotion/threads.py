@@ -11,6 +11,8 @@ from contextvars import ContextVar
 from threading import Lock, current_thread, main_thread
 from typing import Any
 
+from probmotion.extras import is_installed
+
 __all__ = ["one_thread", "only_one_thread"]
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -38,7 +40,7 @@ def one_thread() -> Iterator[None]:
     # In a thread pool, another thread may be importing torch or JAX, and array libraries would use
     # the partially imported module. import_module waits until the import is complete.
     if current_thread() is not main_thread():
-        for name in ("torch", "jax"):
+        for name in filter(is_installed, ("torch", "jax")):
             importlib.import_module(name)
     torch = importlib.import_module("torch") if "torch" in sys.modules else None
     with _SHARED.limited(torch), _per_thread_limits(torch):

@@ -1,11 +1,10 @@
-"""Validation of arguments and of optional packages."""
+"""Validation of arguments."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import fields
 from difflib import get_close_matches
-from importlib import import_module
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
@@ -20,7 +19,6 @@ __all__ = [
     "check_shape",
     "check_types",
     "did_you_mean",
-    "import_extra",
 ]
 
 
@@ -103,21 +101,3 @@ def _fits(value: Any, kind: Any) -> bool:
     if kind is float:
         return isinstance(value, int | float)
     return isinstance(value, NoneType if kind is None else kind)
-
-
-def import_extra(module: str, extra: str) -> Any:
-    """Import a module of the package that an extra of this package installs.
-
-    Raises
-    ------
-    ModuleNotFoundError
-        If the package is missing; the message names the extra.
-    """
-    try:
-        return import_module(module)
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(
-            f"{module.partition('.')[0]} must be installed, got {error}; run pip install "
-            f"'probmotion[{extra}]'",
-            name=error.name,
-        ) from error

@@ -12,11 +12,21 @@ from pathlib import Path
 
 import pytest
 
+from probmotion.extras import OPTIONAL
+
 ROOT = Path(__file__).resolve().parents[1]
 MAX_PACKAGES = 38
 # Top-level packages and their modules outside any subpackage.
 LOOSE = {
-    "probmotion": {"arrays", "citations", "files", "seeds", "threads", "validation"},
+    "probmotion": {
+        "arrays",
+        "citations",
+        "extras",
+        "files",
+        "seeds",
+        "threads",
+        "validation",
+    },
     "probmotion.models": set(),
     "probmotion.samplers": {"adam", "densities", "exact", "independent"},
 }
@@ -135,6 +145,16 @@ def test_samplers_and_models_do_not_import_each_other(graph: Graph) -> None:
     assert imports_between(graph, "probmotion.models", "probmotion.samplers") == []
 
 
+def test_optional_libraries_are_imported_from_extras() -> None:
+    """A missing library is then named with its extra; see :mod:`probmotion.extras`."""
+    for module in MODULES.keys() - {"probmotion.extras"}:
+        for node in ast.walk(ast.parse(MODULES[module].read_text("utf-8"))):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom) and not node.level:
+                names = [str(node.module)]
+            assert not OPTIONAL.keys() & {name.partition(".")[0] for name in names}, module
+
+
 def test_loose_modules_import_only_each_other(graph: Graph) -> None:
     loose = {f"probmotion.{name}" for name in LOOSE["probmotion"]}
     assert set().union(*(graph[module] for module in loose)) <= loose
@@ -177,7 +197,7 @@ def test_test_folders_mirror_the_packages() -> None:
     packages = {package.removeprefix("probmotion/") for package in packages}
     tests = ROOT / "tests"
     folders = {path.parent.relative_to(tests).as_posix() for path in tests.rglob("test_*.py")}
-    assert folders - {".", "fuzz", "studies"} <= packages
+    assert folders - {".", "core", "faults", "fuzz", "studies"} <= packages
 
 
 @pytest.mark.parametrize(

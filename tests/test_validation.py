@@ -1,7 +1,5 @@
 """Validation of arguments: accepted values and messages."""
 
-import sys
-
 import numpy as np
 import pytest
 
@@ -10,7 +8,6 @@ from probmotion.validation import (
     check_finite,
     check_positive,
     check_shape,
-    import_extra,
 )
 
 
@@ -55,13 +52,3 @@ def test_invalid_numbers_are_refused():
     for value, least in ((0, 1), (1.0, 1), (True, 1), ("3", 1), (None, 1), (2, 3)):
         with pytest.raises(ValueError, match=f"n must be an integer of at least {least}, got "):
             check_count("n", value, least)
-
-
-def test_a_missing_package_names_its_extra(monkeypatch):
-    assert import_extra("numpy.linalg", "arrays") is np.linalg
-    monkeypatch.setitem(sys.modules, "blackjax", None)
-    # A module that another test has imported would be found without its package.
-    monkeypatch.delitem(sys.modules, "blackjax.mcmc", raising=False)
-    message = r"blackjax must be installed, got .*; run pip install 'probmotion\[kernels\]'"
-    with pytest.raises(ModuleNotFoundError, match=message):
-        import_extra("blackjax.mcmc", "kernels")

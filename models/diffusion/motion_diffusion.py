@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from probmotion.arrays import Array
+from probmotion.extras import torch
 from probmotion.geometry.cameras import Cameras
 from probmotion.models.diffusion.motion_transformer import MotionTransformer
 from probmotion.models.diffusion.settings import DiffusionSettings

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 
-import torch
-from torch import nn
+from probmotion.extras import nn, torch
 
 __all__ = ["MotionTransformer", "sinusoids"]
 

@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from probmotion import seeds
+from probmotion.extras import torch
 from probmotion.models.diffusion.motion_transformer import MotionTransformer
 from probmotion.posteriors.noise_schedule import NoiseSchedule
 from probmotion.validation import check_count

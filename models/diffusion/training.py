@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import torch
-from torch import nn
 
+from probmotion.extras import nn, torch
 from probmotion.models.diffusion.motion_diffusion import KIND
 from probmotion.models.diffusion.settings import DiffusionSettings
 from probmotion.models.training.settings import TrainingSettings

@@ -7,9 +7,8 @@ from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
-import torch
-from torch import nn
 
+from probmotion.extras import nn, torch
 from probmotion.models.bodies.body_states import to_world
 from probmotion.models.dvae.inference import Denoiser, DenoisingNetworks
 from probmotion.models.dvae.joint_noise import JointNoise

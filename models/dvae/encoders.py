@@ -6,9 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import torch
-from torch import nn
-
+from probmotion.extras import nn, torch
 from probmotion.models.dvae.latent_rollouts import Inference
 from probmotion.models.dvae.layers import State, mean_and_log_scale, n_encoder_inputs, perceptron
 from probmotion.models.dvae.settings import DVAESettings

@@ -12,10 +12,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from torch import nn
 
 from probmotion import seeds
+from probmotion.extras import nn, torch
 from probmotion.models.bodies.body_states import turned_about_vertical
 from probmotion.models.dvae.latent_rollouts import Rollout, rollout
 from probmotion.models.dvae.layers import n_encoder_inputs, perceptron, trust_weight

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import torch
-
+from probmotion.extras import torch
 from probmotion.models.dvae.variational_terms import gaussian_kl
 
 __all__ = ["Generative", "Inference", "Rollout", "rollout"]

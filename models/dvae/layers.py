@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import torch
-from torch import nn
+from probmotion.extras import nn, torch
 
 __all__ = ["State", "mean_and_log_scale", "n_encoder_inputs", "perceptron", "trust_weight"]
 

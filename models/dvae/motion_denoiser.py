@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from probmotion import seeds
+from probmotion.extras import torch
 from probmotion.models.dvae.inference import Bound, Denoiser, DenoisingNetworks, InferenceDraw
 from probmotion.models.dvae.motion_dvae import MotionDVAE
 from probmotion.models.dvae.noisy_windows import NoisyWindows, Stitching, windows_of

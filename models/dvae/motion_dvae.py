@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from probmotion.arrays import Array
+from probmotion.extras import torch
 from probmotion.models.bodies.body_states import BodyStates, check_bones, turned_about_vertical
 from probmotion.models.dvae.latent_rollouts import rollout
 from probmotion.models.dvae.network import DVAEModel

@@ -7,10 +7,9 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from torch import nn
 
 from probmotion import seeds
+from probmotion.extras import nn, torch
 from probmotion.geometry.rotations import matrix_to_rotation_6d, rotation_6d_to_matrix
 from probmotion.models.bodies.body_states import BodyStates, heading_of
 from probmotion.motion.motion import Motion

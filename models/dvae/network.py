@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 
-import torch
-from torch import nn
-
 from probmotion import seeds
+from probmotion.extras import nn, torch
 from probmotion.models.bodies.body_states import BodyStates
 from probmotion.models.dvae.encoders import EncoderInputs, JointEncoder, TrackingEncoder
 from probmotion.models.dvae.latent_rollouts import Rollout

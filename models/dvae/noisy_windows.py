@@ -8,8 +8,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import torch
 
+from probmotion.extras import torch
 from probmotion.models.bodies.body_states import turned_about_vertical
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.likelihoods import Joints3D

@@ -8,10 +8,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import torch
-from torch import nn
 
 from probmotion import seeds
+from probmotion.extras import nn, torch
 from probmotion.models.bodies.body_states import BodyStates
 from probmotion.models.dvae.latent_rollouts import rollout
 from probmotion.models.dvae.motion_dvae import KIND, MotionDVAE, description_of

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 
-import torch
-from torch import Tensor
+from probmotion.extras import torch
 
 __all__ = ["expected_log_normal", "gaussian_kl", "inverse_gamma_kl", "log_normal"]
 
@@ -17,8 +16,11 @@ _HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
 
 
 def gaussian_kl(
-    mean: Tensor, log_scale: Tensor, prior_mean: Tensor, prior_log_scale: Tensor
-) -> Tensor:
+    mean: torch.Tensor,
+    log_scale: torch.Tensor,
+    prior_mean: torch.Tensor,
+    prior_log_scale: torch.Tensor,
+) -> torch.Tensor:
     """Return KL(q ‖ p) of diagonal Gaussians, ``(…, D) → (…)``.
 
     Arguments are the means and log standard deviations of q, then of p.
@@ -30,8 +32,11 @@ def gaussian_kl(
 
 
 def inverse_gamma_kl(
-    alpha: Tensor, beta: Tensor, prior_alpha: Tensor | float, prior_beta: Tensor | float
-) -> Tensor:
+    alpha: torch.Tensor,
+    beta: torch.Tensor,
+    prior_alpha: torch.Tensor | float,
+    prior_beta: torch.Tensor | float,
+) -> torch.Tensor:
     """Return KL(IG(α, β) ‖ IG(α₀, β₀)) elementwise, with density ∝ v^(−α−1) exp(−β/v).
 
     The result is (α − α₀) ψ(α) − log Γ(α) + log Γ(α₀) + α₀ (log β − log β₀) + α (β₀ − β)/β. In
@@ -49,8 +54,8 @@ def inverse_gamma_kl(
 
 
 def expected_log_normal(
-    residual: Tensor, alpha: Tensor, beta: Tensor, scale: Tensor | float
-) -> Tensor:
+    residual: torch.Tensor, alpha: torch.Tensor, beta: torch.Tensor, scale: torch.Tensor | float
+) -> torch.Tensor:
     """Return E[log N(residual; 0, s² v̄)] over v̄ ~ IG(α, β), elementwise.
 
     The result is −½ (log 2π + log s² + log β − ψ(α) + (α/β) residual²/s²), as E[1/v̄] = α/β and
@@ -62,10 +67,10 @@ def expected_log_normal(
     return -0.5 * (log_variance + alpha / beta * square) - _log_scale(scale) - _HALF_LOG_TWO_PI
 
 
-def log_normal(residual: Tensor, scale: Tensor | float) -> Tensor:
+def log_normal(residual: torch.Tensor, scale: torch.Tensor | float) -> torch.Tensor:
     """Return log N(residual; 0, s²), elementwise; ``residual`` and ``scale`` (s) in metres."""
     return -0.5 * (residual / scale) ** 2 - _log_scale(scale) - _HALF_LOG_TWO_PI
 
 
-def _log_scale(scale: Tensor | float) -> Tensor | float:
-    return torch.log(scale) if isinstance(scale, Tensor) else math.log(scale)
+def _log_scale(scale: torch.Tensor | float) -> torch.Tensor | float:
+    return torch.log(scale) if isinstance(scale, torch.Tensor) else math.log(scale)

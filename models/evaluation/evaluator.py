@@ -9,8 +9,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import torch
 
+from probmotion.extras import torch
 from probmotion.models.evaluation.track_autoencoder import EvaluatorSettings, TrackEncoder
 from probmotion.models.training.checkpoints import Checkpoint, load_weights, save_checkpoint
 from probmotion.models.training.track_network import TrackNetwork, load_track_checkpoint

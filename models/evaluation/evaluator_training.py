@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import torch
-from torch import nn
 
 from probmotion import seeds
+from probmotion.extras import nn, torch
 from probmotion.models.evaluation.evaluator import KIND
 from probmotion.models.evaluation.track_autoencoder import EvaluatorSettings, TrackAutoencoder
 from probmotion.models.training.track_batches import TrackBatches

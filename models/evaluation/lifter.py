@@ -13,10 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
-from torch import nn
 
 from probmotion import seeds
+from probmotion.extras import nn, torch
 from probmotion.models.training.checkpoints import load_checkpoint, load_weights
 from probmotion.models.training.trainer import check_device
 from probmotion.motion.skeleton import Skeleton

@@ -12,9 +12,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-import torch
-from torch import nn
 
+from probmotion.extras import nn, torch
 from probmotion.models.evaluation.lifter import (
     KIND,
     LifterNetwork,

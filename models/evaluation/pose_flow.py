@@ -15,10 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from torch import nn
 
 from probmotion import seeds
+from probmotion.extras import nn, torch
 from probmotion.models.training.checkpoints import load_checkpoint, load_weights
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_count, check_shape

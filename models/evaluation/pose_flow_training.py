@@ -7,10 +7,9 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-import torch
-from torch import nn
 
 from probmotion import seeds
+from probmotion.extras import nn, torch
 from probmotion.models.evaluation.pose_flow import KIND, FlowSettings, PoseFlow
 from probmotion.models.training.track_batches import describe_tracks
 from probmotion.motion.motion import KeypointTrack

@@ -7,9 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
-from torch import nn
-
+from probmotion.extras import nn, torch
 from probmotion.models.diffusion.motion_transformer import sinusoids
 from probmotion.models.diffusion.settings import TransformerSettings
 from probmotion.validation import check_count, check_positive

@@ -11,10 +11,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import torch
 
 from probmotion import seeds
 from probmotion.arrays import Array, constant
+from probmotion.extras import torch
 from probmotion.models.latent.standard_normal import StandardNormalPrior
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.protocols import ChecksObservations, Likelihood

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-import torch
 from array_api_compat import is_jax_array, is_numpy_array, is_torch_array
 
 from probmotion.arrays import Array, to_numpy
+from probmotion.extras import torch
 from probmotion.validation import check_finite, check_shape
 
 __all__ = ["decode_rows"]

@@ -8,8 +8,9 @@ Coordinates on the ground have twice as many rows: in each band first those of a
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from probmotion.extras import numba
 
 __all__ = ["cross_products", "from_bases", "to_bases"]
 

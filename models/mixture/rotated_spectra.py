@@ -20,8 +20,13 @@ from typing import NamedTuple
 import numpy as np
 
 from probmotion.arrays import Array, array_namespace, constant, logsumexp
-from probmotion.models.mixture._spectral_kernels import cross_products, from_bases, to_bases
+from probmotion.extras import is_installed
 from probmotion.models.mixture.rotated_mixture import rotation_coefficients
+
+if is_installed("numba"):
+    from probmotion.models.mixture._spectral_kernels import cross_products, from_bases, to_bases
+else:
+    from probmotion.models.mixture._spectral_products import cross_products, from_bases, to_bases
 
 __all__ = ["RotatedSpectra", "blocks"]
 

@@ -5,8 +5,9 @@ Vectors are tuples, and matrices are tuples of columns; Numba compiles both to r
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from probmotion.extras import numba
 
 __all__ = [
     "NO_LENGTH", "Frame", "Vector", "cell_of", "closeness_of", "from_frame", "in_frame",

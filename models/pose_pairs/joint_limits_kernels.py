@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from probmotion.extras import numba
 from probmotion.models.pose_pairs.joint_limits_frames import (
     NO_LENGTH,
     Frame,

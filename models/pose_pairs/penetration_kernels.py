@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from probmotion.extras import numba
 
 __all__ = ["capsule_depth", "segment_distance", "total_depths"]
 

@@ -10,9 +10,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import torch
-from torch import nn
-
+from probmotion.extras import nn, torch
 from probmotion.files import written_whole
 from probmotion.models.training.checkpoints import (
     MODEL,

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from torch import nn
 
+from probmotion.extras import nn
 from probmotion.models.training.checkpoints import Checkpoint, load_checkpoint, valid_settings
 from probmotion.models.training.standardisation import Standards
 from probmotion.models.training.trainer import check_device

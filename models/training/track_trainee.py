@@ -7,10 +7,9 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-import torch
-from torch import nn
 
 from probmotion import seeds
+from probmotion.extras import nn, torch
 from probmotion.models.training.track_batches import Augmentation, learning_and_held_out
 from probmotion.motion.motion import KeypointTrack
 

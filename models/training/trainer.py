@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-import torch
-from torch import nn
 
 from probmotion import seeds
+from probmotion.extras import nn, torch
+from probmotion.files import forget_killed, locked_folder, writable_folder
 from probmotion.models.training.checkpoints import MODEL
 from probmotion.models.training.runs import STATE, Run, keep_run, resume_run
 from probmotion.models.training.settings import TrainingSettings
@@ -126,13 +126,23 @@ def train(
     Diverged
         If a loss, gradient or weight is not finite; the last good checkpoint remains.
     ValueError
-        If ``out`` contains a run with other settings or data, or the device is not available.
+        If ``out`` contains a run with other settings or data, or another process trains in it, or
+        the device is not available.
+    OSError
+        If ``out`` cannot be written to; the last checkpoint remains.
     KeyboardInterrupt
         On Ctrl-C or SIGTERM, after finishing the current step and saving the run.
     """
     target = check_device(device)
-    folder = Path(out)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = writable_folder(Path(out))
+    with locked_folder("out", folder):
+        forget_killed(folder)
+        return _trained(trainee, settings, folder, target, progress)
+
+
+def _trained(
+    trainee: Trainee, settings: TrainingSettings, folder: Path, target: torch.device, progress: bool
+) -> TrainingResult:
     run = _start(trainee, settings, target)
     # JSON has neither tuples nor infinity.
     clip = None if math.isinf(settings.clip) else settings.clip

@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import torch
 
+from probmotion.extras import torch
 from probmotion.models.vae.model import MotionVAEModel
 from probmotion.models.vae.observed_views import observed_view
 from probmotion.posteriors.likelihoods import Keypoints2D

@@ -9,10 +9,7 @@ shipped checkpoints.
 
 from __future__ import annotations
 
-import torch
-from torch import nn
-from torch.nn import functional
-
+from probmotion.extras import nn, torch
 from probmotion.models.vae.settings import MotionVAESettings
 from probmotion.models.vae.short_attention import short_attention
 from probmotion.validation import check_shape
@@ -95,7 +92,7 @@ class TransformerLayer(nn.Module):
         """
         linear, width = self.asked_keys_values, tokens.shape[-1]
         query_weights, key_weights, value_weights = linear.weight.unflatten(0, (3, self.heads, -1))
-        queries = functional.linear(
+        queries = nn.functional.linear(
             tokens[:, :first], query_weights.flatten(0, 1), linear.bias[:width]
         )
         queries = torch.einsum(
@@ -164,7 +161,7 @@ class FrameEncoder(nn.Module):
             local = torch.where(seen[..., None], features[1], 0.0)
             parts += [features[0][:, :, None].expand_as(local), local]
         described = torch.cat(parts, dim=-1).flatten(0, 1)
-        seen = functional.pad(seen.flatten(0, 1), (1, 0), value=True)
+        seen = nn.functional.pad(seen.flatten(0, 1), (1, 0), value=True)
         batches = zip(described.split(FRAMES_AT_ONCE), seen.split(FRAMES_AT_ONCE), strict=True)
         result = torch.cat([self._encode(part, mask) for part, mask in batches])
         return result.unflatten(0, keypoints.shape[:2])
@@ -209,7 +206,7 @@ def _attend(packed: torch.Tensor, heads: int, seen: torch.Tensor | None) -> torc
         return short_attention(packed, heads, seen)
     queries, keys, values = packed.unflatten(-1, (3, heads, -1)).permute(2, 0, 3, 1, 4)
     mask = None if seen is None else seen[:, None, None]
-    result = functional.scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
+    result = nn.functional.scaled_dot_product_attention(queries, keys, values, attn_mask=mask)
     return result.transpose(1, 2).flatten(2)
 
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-import torch
 
+from probmotion.extras import torch
 from probmotion.models.bodies.articulated_body import ArticulatedBody
 from probmotion.models.vae.pose_network import PoseHypotheses, PoseNetwork
 from probmotion.models.vae.settings import MotionVAESettings

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
-from torch import nn
-
+from probmotion.extras import nn
 from probmotion.models.bodies.articulated_body import ArticulatedBody
 from probmotion.models.vae.network import MotionVAENetwork
 from probmotion.models.vae.pose_network import PoseNetwork

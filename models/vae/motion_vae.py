@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-import torch
 
 from probmotion.arrays import Array
+from probmotion.extras import torch
 from probmotion.models.bodies.articulated_body import ArticulatedBody
 from probmotion.models.latent.row_decoding import decode_rows
 from probmotion.models.latent.standard_normal import StandardNormalPrior

@@ -6,10 +6,8 @@ frames, E_t, encode q(z); transformers with timestamp queries, D_t, and bone que
 
 from __future__ import annotations
 
-import torch
-from torch import nn
-
 from probmotion import seeds
+from probmotion.extras import nn, torch
 from probmotion.models.diffusion.motion_transformer import sinusoids
 from probmotion.models.vae.layers import (
     BoneDecoder,

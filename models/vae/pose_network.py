@@ -11,10 +11,8 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import torch
-from torch import nn
-
 from probmotion import seeds
+from probmotion.extras import nn, torch
 from probmotion.geometry.rotations import rotation_6d_to_matrix, vector_to_matrix
 from probmotion.models.vae.layers import (
     BoneDecoder,

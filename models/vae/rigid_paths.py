@@ -10,8 +10,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
+from probmotion.extras import torch
 from probmotion.models.bodies.articulated_body import ArticulatedBody
 from probmotion.models.vae.losses import best_hypothesis, predicted_hypotheses
 from probmotion.models.vae.observed_views import ObservedView, observed_view

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
-from torch.autograd import Function
-from torch.autograd.function import once_differentiable
+from probmotion.extras import torch
 
 __all__ = ["short_attention"]
 
@@ -26,7 +24,7 @@ def short_attention(
     return _ShortAttention.apply(packed, heads, seen)
 
 
-class _ShortAttention(Function):
+class _ShortAttention(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, packed: torch.Tensor, heads: int, seen: torch.Tensor | None
@@ -43,7 +41,7 @@ class _ShortAttention(Function):
         return torch.bmm(weights, values).unflatten(0, (-1, heads)).transpose(1, 2).flatten(2)
 
     @staticmethod
-    @once_differentiable
+    @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         split, weights = ctx.saved_tensors
         queries, keys, values = split

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import torch
-
+from probmotion.extras import torch
 from probmotion.models.training.track_batches import Batch, TrackBatches
 from probmotion.models.vae.layers import FRAMES_AT_ONCE
 from probmotion.models.vae.pose_network import PoseHypotheses, PoseNetwork

@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from torch import nn
 
+from probmotion.extras import nn, torch
 from probmotion.models.bodies.articulated_body import ArticulatedBody
 from probmotion.models.dvae.variational_terms import gaussian_kl
 from probmotion.models.training.checkpoints import load_checkpoint, load_weights

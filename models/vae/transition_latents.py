@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
-import torch
 
+from probmotion.extras import torch
 from probmotion.geometry.rotations import matrix_to_vector, vector_to_matrix
 from probmotion.models.vae.motion_vae import MotionVAE
 from probmotion.validation import check_count, check_finite, check_shape

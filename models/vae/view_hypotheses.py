@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from probmotion import seeds
 from probmotion.data.projections import DetectorNoise, Filming, centre_motion
+from probmotion.extras import torch
 from probmotion.models.bodies.articulated_body import ArticulatedBody
 from probmotion.models.vae.losses import predicted_hypotheses
 from probmotion.models.vae.pose_network import PoseNetwork

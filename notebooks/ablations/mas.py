@@ -59,6 +59,7 @@ from probmotion.posteriors.sampling import Sampler
 from probmotion.problems import load_problem
 from probmotion.samplers import MultiViewAncestral, MultiViewPredictorCorrector, ScoreDistillation
 from probmotion.samplers.diffusion.ancestral2d import Ancestral2D
+from probmotion.samplers.diffusion.integrators import DDPM, SecondOrderSDE
 from probmotion.samplers.diffusion.noise_levels import Cosine
 
 SEED = 0
@@ -409,18 +410,29 @@ def tracks(study: Study) -> pd.DataFrame:
 
 
 def strided(study: Study) -> pd.DataFrame:
-    """Return the metrics of MAS and mvpc at fewer noise levels than in training."""
+    """Return the metrics of MAS and mvpc by number of noise levels and integrator."""
     real = study.motions("test")
-    variants: dict[tuple[int, str], Sampler] = {}
-    for steps in (10, 20, 50, 100):
-        fewer = {"steps": steps, "levels": Cosine(trained_steps=100)}
-        variants[steps, "MAS"] = MultiViewAncestral(**fewer, perspective=True)
-        variants[steps, "mvpc"] = replace(MultiViewPredictorCorrector.learnt(), **fewer)
-    labelled = {f"{name}, {steps} steps": sampler for (steps, name), sampler in variants.items()}
+    defaults = {
+        "MAS": MultiViewAncestral(perspective=True),
+        "mvpc": MultiViewPredictorCorrector.learnt(),
+    }
+    integrators = {"first order": DDPM(), "second order": SecondOrderSDE()}
+    levels = Cosine(trained_steps=100)
+    variants: dict[tuple[str, int, str], Sampler] = {
+        (name, steps, order): replace(sampler, steps=steps, levels=levels, integrator=integrator)
+        for name, sampler in defaults.items()
+        for steps in (20, 50, 100)
+        for order, integrator in integrators.items()
+    }
+    labelled = {
+        f"{name}, {order}, {steps} steps": sampler
+        for (name, steps, order), sampler in variants.items()
+    }
     comparison = study.compared("strided", {"walks": study.problem}, labelled)
     rows = []
-    for (steps, name), run in zip(variants, comparison.results, strict=True):
-        rows.append({"steps": steps, **score_run(study, name, comparison, run, real)})
+    for (name, steps, order), run in zip(variants, comparison.results, strict=True):
+        row = score_run(study, name, comparison, run, real)
+        rows.append({"steps": steps, "order": order, **row})
         print(rows[-1], flush=True)
     return pd.DataFrame(rows)
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from probmotion import seeds
 from probmotion.arrays import to_numpy
-from probmotion.metrics.credible_sets import DENSITY
 from probmotion.metrics.measures import visible_joints
+from probmotion.metrics.uniformity import DENSITY
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.problem import Problem
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from probmotion import seeds
 from probmotion.calibration.quantities import log_densities, quantities
-from probmotion.metrics.credible_sets import DISTANCE
+from probmotion.metrics.uniformity import DISTANCE
 from probmotion.posteriors.draws import MotionDraws
 from probmotion.posteriors.problem import Problem
 

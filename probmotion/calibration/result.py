@@ -161,7 +161,7 @@ class Calibration:
         """Return the coverage of credible sets by quantity and level.
 
         Columns: quantity, level, coverage and its 95 % interval, lower to upper. Credible sets are
-        those of :func:`~probmotion.metrics.credible_sets.credible_level`.
+        those of :func:`~probmotion.metrics.uniformity.credible_level`.
         """
         from probmotion.calibration.table import coverage_frame
 

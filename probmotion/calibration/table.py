@@ -11,8 +11,13 @@ import pandas as pd
 from scipy.stats import binomtest
 
 from probmotion.comparison.results.failures import Failure
-from probmotion.metrics.credible_sets import DENSITY, DISTANCE, credible_level
-from probmotion.metrics.uniformity import adjusted_p_values, uniformity_p_value
+from probmotion.metrics.uniformity import (
+    DENSITY,
+    DISTANCE,
+    adjusted_p_values,
+    credible_level,
+    uniformity_p_value,
+)
 
 __all__ = [
     "LEVELS", "CalibrationRanks", "CalibrationTable", "coverage_curve", "coverage_frame", "verdict",

@@ -18,6 +18,7 @@ from probmotion.cli.compare import Compare
 from probmotion.cli.denoise import Denoise
 from probmotion.cli.files import Convert, Report, Show
 from probmotion.cli.lift import Lift
+from probmotion.cli.pairs import Pairs
 from probmotion.cli.reference import Reference
 from probmotion.cli.which import Which
 
@@ -35,6 +36,7 @@ commands:
   show       summarise a file, or a network, sampler or problem by name
   convert    convert a motion to another format, frame rate or skeleton
   lift       lift a video's 2D keypoints to 3D motion, for Blender and the browser
+  pairs      lift two people who interact, from a video's 2D keypoints and one 3D pose-pair
   denoise    denoise recorded 3D joints and fill gaps
   train      train a prior, or a network for evaluating priors
   reference  generate certified reference draws of a problem
@@ -85,7 +87,7 @@ def _first_line(kind: Any) -> str:
 
 _COMMANDS: dict[str, type[Any]] = {
     "compare": Compare, "report": Report, "which": Which, "list": List, "show": Show,
-    "convert": Convert, "denoise": Denoise, "lift": Lift, "reference": Reference,
+    "convert": Convert, "denoise": Denoise, "lift": Lift, "pairs": Pairs, "reference": Reference,
 }  # fmt: skip
 
 

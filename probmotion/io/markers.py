@@ -26,7 +26,6 @@ from probmotion.io.errors import (
 )
 from probmotion.motion.motion import JointTrack
 from probmotion.motion.skeleton import Skeleton
-from probmotion.validation import import_extra
 
 __all__ = ["read_c3d", "read_trc"]
 
@@ -122,7 +121,8 @@ def read_c3d(path: str | Path, unit: str | None = None) -> JointTrack:
     """
     path = Path(path)
     read_bytes(path)  # raises for missing and unreadable files
-    ezc3d = import_extra("ezc3d", "c3d")
+    from probmotion.extras import ezc3d
+
     try:
         file = ezc3d.c3d(str(path))
         point: dict[str, Any] = file["parameters"]["POINT"]

@@ -29,7 +29,7 @@ from probmotion.lifting.sides import consistent_sides
 from probmotion.lifting.window_fit import PROPORTIONS, Observed, lift_window_views
 from probmotion.lifting.window_posterior import WindowPosterior
 from probmotion.lifting.window_prior import WindowPrior
-from probmotion.lifting.windows import cut, fitted, stitched
+from probmotion.lifting.windows import cut, stitched
 from probmotion.motion.motion import KeypointTrack
 from probmotion.posteriors.sampling import progress_bar
 from probmotion.threads import one_thread
@@ -228,13 +228,21 @@ def lift_views(
         recording = recording.sized(size)
         estimate, mirrored = _noise(recording, chosen, first)
         level = noise or estimate
-        posteriors = fitted(lambda start: recording.posterior(start, level), starts, bar.update)
-        mean, chains = stitched(posteriors, starts, step, frames, draws, seed)
+        mean, chains, windows = stitched(
+            lambda start: recording.posterior(start, level),
+            starts,
+            step,
+            frames,
+            draws,
+            seed,
+            bar.update,
+        )
     evidence = [
-        Evidence(each, fps, camera, level, mean, posteriors, mirrored)
+        Evidence(each, fps, camera, level, mean, windows, mirrored)
         for each, camera in zip(keypoints, recording.cameras.views, strict=True)
     ]
-    return LiftedViews(size * mean, size * chains, level, keypoints, _worst(evidence))
+    chains *= size
+    return LiftedViews(size * mean, chains, level, keypoints, _worst(evidence))
 
 
 def _noise(recording: _Recording, starts: Sequence[int], noise: float) -> tuple[float, float]:

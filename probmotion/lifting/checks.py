@@ -10,7 +10,7 @@ import numpy as np
 
 from probmotion.lifting.camera import LevelCamera
 from probmotion.lifting.keypoints import PERSON, PersonKeypoints, averaged
-from probmotion.lifting.window_posterior import WindowPosterior
+from probmotion.lifting.window_posterior import WindowSummary
 
 __all__ = ["MEDIAN", "Check", "Evidence", "checked"]
 
@@ -44,7 +44,7 @@ class Check:
 
 
 class Evidence(NamedTuple):
-    """Keypoints, frame rate, camera, noise (pixels), mean (L, J, 3) and windows' posteriors.
+    """Keypoints, frame rate, camera, noise (pixels), mean (L, J, 3) and summaries of the windows.
 
     ``mirrored`` is the log evidence per window of keypoints with exchanged sides, minus that of the
     given ones; with an estimated pitch, both include the tempered log density of the pitch.
@@ -55,7 +55,7 @@ class Evidence(NamedTuple):
     camera: LevelCamera
     noise: float
     mean: np.ndarray
-    posteriors: Sequence[WindowPosterior]
+    windows: Sequence[WindowSummary]
     mirrored: float
 
 
@@ -100,17 +100,13 @@ def checked(evidence: Evidence) -> tuple[Check, ...]:
         if count >= enough
     ]
     depth = evidence.camera.depth(evidence.mean).mean()
-    bones = PERSON.n_joints - 1
-    bests = [posterior.best for posterior in evidence.posteriors]
-    surprise = [best.scale * (best.mean[:-bones] ** 2).mean() for best in bests]
-    proportions = [(best.mean[-bones:] ** 2).mean() for best in bests]
     values = {
         "noise": evidence.noise * depth / evidence.camera.focal,
         "residual": max(joints),
         "unsteady": _unsteadiness(evidence),
-        "posture": np.median([best.posture for best in bests]),
-        "surprise": np.median(surprise),
-        "proportions": np.median(proportions),
+        "posture": np.median([window.posture for window in evidence.windows]),
+        "surprise": np.median([window.surprise for window in evidence.windows]),
+        "proportions": np.median([window.proportions for window in evidence.windows]),
         "mirrored": evidence.mirrored,
     }
     return tuple(

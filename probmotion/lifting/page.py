@@ -31,6 +31,9 @@ h1 { font-size: 1.4rem; } .quiet { color: #666; }
 .bad { border-left: .4rem solid #c00; padding-left: .8rem; }
 .good { border-left: .4rem solid #0a7d33; padding-left: .8rem; }
 table { border-collapse: collapse; } td, th { padding: .15rem .8rem .15rem 0; text-align: left; }
+.cards { grid-template-columns: minmax(0, 24rem); justify-content: center; }
+td:last-child { overflow-wrap: anywhere; }
+@media (max-width: 30rem) { td, th { padding-right: .4rem; font-size: .85rem; } }
 td:nth-child(n + 2) { font-variant-numeric: tabular-nums; }
 """
 
@@ -39,6 +42,7 @@ def lift_page(
     motion: Motion,
     draws: np.ndarray,
     cameras: Cameras,
+    camera_names: Sequence[str],
     keypoints: np.ndarray,
     checks: Sequence[Check],
     sentences: Sequence[str],
@@ -53,6 +57,8 @@ def lift_page(
         Posterior draws, metres.
     cameras : Cameras
         The V cameras; the animation shows the view with the most keypoints.
+    camera_names : sequence of str
+        Names of calibrated cameras; empty without a calibration.
     keypoints : ndarray, (V, L, J, 2)
         Keypoints, pixels; NaN where missing.
     checks : sequence of Check
@@ -70,8 +76,10 @@ def lift_page(
     )
     rows = {"lift": np.concatenate([motion.positions[None], shown_draws])}
     shown = Shown(problem, rows, step, overlaid=True)
-    captions = {"lift": "mean and three draws; joints coloured by their standard deviation"}
-    animation = animation_html(name, shown, captions)
+    caption = "mean and three draws; joints coloured by their standard deviation"
+    if cameras.n_views > 1:
+        caption += f"; the camera’s view and keypoints are those of {camera_names[view]}"
+    animation = animation_html(name, shown, {"lift": caption})
     table = "\n".join(
         f"<tr><td>{escape(check.name)}</td><td>{check.value:.3g}</td><td>{check.limit:.3g}</td>"
         f"<td>{'passed' if check.passed else escape(check.problem)}</td></tr>"
@@ -80,7 +88,7 @@ def lift_page(
     mark = "good" if all(check.passed for check in checks) else "bad"
     summary = "".join(f"<p>{escape(sentence)}</p>" for sentence in sentences)
     count = "one camera" if cameras.n_views == 1 else f"{cameras.n_views} cameras"
-    title = escape(f"{name}: 3D motion from {count}")
+    title = escape(f"{motion.name}: 3D motion from {count}".removeprefix(": "))
     return f"""\
 <!DOCTYPE html>
 <html lang="en">

@@ -189,17 +189,18 @@ def _before_camera(
     camera = LevelCamera(focal, (image_size[0] / 2, image_size[1] / 2))
     known = None if pitch is None else float(np.radians(pitch))
     seen = settings.lift(keypoints, track.fps, camera, known, _NOISE * max(image_size))
-    chains = seen.draws
+    draws = seen.draws  # large: changed in place
     if fov is None:
         # The image of a body is nearly the same at r times the distance for r times the focal
         # length. Keypoints hardly tell them apart.
         rng = seeds.generator(settings.seed, "lift: focal length")
         ratio = np.exp(_FOCAL_SPREAD * rng.standard_normal((settings.draws, 1, 1)))
-        chains = chains.copy()
-        chains[..., 2] += (ratio - 1) * chains[:, :, :1, 2]
+        draws[..., 2] += (ratio - 1) * draws[:, :, :1, 2]
     scale, spread = settings.size
     # Size, distance and the camera's height are proportional.
-    draws = scale * (chains - [0.0, seen.floor, 0.0]) * _sizes(spread, settings)
+    draws[..., 1] -= seen.floor
+    draws *= scale
+    draws *= _sizes(spread, settings)
     mean = scale * (seen.mean - [0.0, seen.floor, 0.0])
     placed = replace(seen.camera, position=(0.0, -scale * seen.floor, 0.0))
     return Lift(
@@ -271,11 +272,10 @@ def _placed(view: CalibratedView, fps: float, guess: float, settings: _Settings)
     scale, spread = scale * ratio, float(precisions.sum() ** -0.5)
     check_size(scale)
     turn = rotation(view.camera.heading).T
-    mean, draws = (
-        scale * positions @ turn + view.camera.position
-        for positions in (seen.mean, seen.draws * _sizes(spread, settings))
-    )
-    return LiftedViews(mean, draws, seen.noise, [view.keypoints], seen.checks)
+    mean = scale * seen.mean @ turn + view.camera.position
+    for draw, own in zip(seen.draws, _sizes(spread, settings), strict=True):
+        draw[:] = scale * (draw * own) @ turn + view.camera.position
+    return LiftedViews(mean, seen.draws, seen.noise, [view.keypoints], seen.checks)
 
 
 def _sizes(spread: float, settings: _Settings) -> np.ndarray:

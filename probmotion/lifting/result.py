@@ -23,6 +23,8 @@ from probmotion.motion.motion import Motion
 
 __all__ = ["Lift"]
 
+_BLOCK = 1000  # frames
+
 
 @dataclass(frozen=True, eq=False)
 class Lift:
@@ -67,7 +69,10 @@ class Lift:
     @cached_property
     def sd(self) -> np.ndarray:
         """Posterior standard deviation of positions relative to the hips, (L, J, 3), metres."""
-        deviation: np.ndarray = from_hips(self.draws).std(axis=0, ddof=1)
+        deviation = np.empty(self.draws.shape[1:])
+        for first in range(0, len(deviation), _BLOCK):  # long recordings have large draws
+            rows = slice(first, first + _BLOCK)
+            deviation[rows] = from_hips(self.draws[:, rows]).std(axis=0, ddof=1)
         return deviation
 
     @property
@@ -134,7 +139,15 @@ class Lift:
             raise ValueError(f"path must end in .html, got {str(path)!r}")
         with written_whole(path) as unfinished:
             seen = np.where(self.weight[..., None] > 0, self.keypoints, np.nan)
-            page = lift_page(self.mean, self.draws, self.cameras, seen, self.checks, self.summary())
+            page = lift_page(
+                self.mean,
+                self.draws,
+                self.cameras,
+                self.camera_names,
+                seen,
+                self.checks,
+                self.summary(),
+            )
             unfinished.write_text(page, encoding="utf-8")
         return path
 

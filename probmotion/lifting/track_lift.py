@@ -23,12 +23,13 @@ from probmotion.lifting.keypoints import (
 from probmotion.lifting.window_fit import Observed, lift_window
 from probmotion.lifting.window_posterior import TEMPER, WindowMode, WindowPosterior
 from probmotion.lifting.window_prior import WindowPrior
-from probmotion.lifting.windows import cut, fitted, stitched
+from probmotion.lifting.windows import cut, stitched
 from probmotion.posteriors.sampling import progress_bar
 from probmotion.threads import one_thread
 
 __all__ = ["TrackLift", "lift_track"]
 
+_SAME = np.radians(3.0)  # largest difference of estimates that are one
 _PITCHES = np.radians([-20.0, 0.0, 20.0])  # first estimates
 _PITCH, _PITCH_SPREAD = np.radians([-5.0, 12.0])  # of cameras: mean and standard deviation
 _PITCH_ERROR = np.radians(3.0)  # standard deviation about the probable values
@@ -114,16 +115,20 @@ def lift_track(
                 (windows, windows.mirrored()),
             )
         level, found = noise or estimate.noise, replace(camera, pitch=estimate.pitch)
-        posteriors = fitted(
-            lambda start: windows.posterior(start, found, level), windows.starts, bar.update
+        mean, chains, summaries = stitched(
+            lambda start: windows.posterior(start, found, level),
+            windows.starts,
+            windows.step,
+            len(keypoints.points),
+            draws,
+            seed,
+            bar.update,
         )
-        frames = len(keypoints.points)
-        mean, chains = stitched(posteriors, windows.starts, windows.step, frames, draws, seed)
-    floor = float(np.median([_floor(posterior) for posterior in posteriors]))
+    floor = float(np.median([summary.floor for summary in summaries]))
     mirrored = other.score - estimate.score
-    evidence = Evidence(keypoints, fps, found, level, mean, posteriors, mirrored)
+    evidence = Evidence(keypoints, fps, found, level, mean, summaries, mirrored)
     if pitch is None:
-        chains = _tilted(chains, estimate, seed)
+        _tilt(chains, estimate, seed)
     return TrackLift(mean, chains, floor, found, level, checked(evidence))
 
 
@@ -176,6 +181,8 @@ def _estimated(
         pitches = np.array([np.median([mode.pitch for mode in modes]) for modes in tried])
         scores = np.array([sum(mode.score for mode in modes) for modes in tried])
         logs = TEMPER * scores + _log_pitch(pitches)
+        kept = _distinct(pitches, logs)
+        pitches, logs = pitches[kept], logs[kept]
     probabilities = np.exp(logs - logs.max())
     probabilities /= probabilities.sum()
     estimate = probabilities @ pitches
@@ -186,14 +193,23 @@ def _estimated(
     return _Estimate(score / len(chosen), noise, pitches, probabilities)
 
 
+def _distinct(pitches: np.ndarray, logs: np.ndarray) -> list[int]:
+    """Return the indices of pitches that differ, the most probable of those that do not."""
+    kept: list[int] = []
+    for index in np.argsort(-logs).tolist():
+        if (np.abs(pitches[kept] - pitches[index]) > _SAME).all():
+            kept.append(index)
+    return kept
+
+
 def _log_pitch(pitch: np.ndarray) -> np.ndarray:
     """Return the log density of the camera's pitch up to a constant."""
     density: np.ndarray = -0.5 * ((pitch - _PITCH) / _PITCH_SPREAD) ** 2
     return density
 
 
-def _tilted(draws: np.ndarray, estimate: _Estimate, seed: int) -> np.ndarray:
-    """Return the draws, each for a pitch of its own: turned about the camera.
+def _tilt(draws: np.ndarray, estimate: _Estimate, seed: int) -> None:
+    """Turn the draws about the camera, each to a pitch of its own.
 
     The pelvis keeps its height, as the floor is level.
     """
@@ -201,12 +217,8 @@ def _tilted(draws: np.ndarray, estimate: _Estimate, seed: int) -> np.ndarray:
     count = len(draws)
     chosen = rng.choice(len(estimate.pitches), count, p=estimate.probabilities)
     turn = estimate.pitches[chosen] - estimate.pitch + _PITCH_ERROR * rng.standard_normal(count)
-    vectors = turn[:, None] * [1.0, 0.0, 0.0]
-    turned: np.ndarray = draws @ vector_to_matrix(vectors)[:, None].swapaxes(-1, -2)
-    turned[..., 1] -= (turned - draws)[..., :1, 1]
-    return turned
-
-
-def _floor(posterior: WindowPosterior) -> float:
-    """Return the height of the floor relative to the camera in the most probable mode."""
-    return float(posterior.origin[1] + posterior.floor(posterior.best))
+    matrices = vector_to_matrix(turn[:, None] * [1.0, 0.0, 0.0])
+    for draw, matrix in zip(draws, matrices, strict=True):
+        height = draw[:, :1, 1].copy()
+        draw[:] = draw @ matrix.T
+        draw[..., 1] -= draw[:, :1, 1] - height

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -10,7 +11,9 @@ from scipy.linalg import solve_triangular
 from probmotion.lifting.window_prior import WindowPrior
 from probmotion.models.mixture.conditioning import rotation
 
-__all__ = ["FLOOR_SPREAD", "TEMPER", "WindowGaussian", "WindowMode", "WindowPosterior"]
+__all__ = [
+    "FLOOR_SPREAD", "TEMPER", "WindowGaussian", "WindowMode", "WindowPosterior", "WindowSummary",
+]  # fmt: skip
 
 FLOOR_SPREAD = 0.3
 """Standard deviation of the floor's height about the window's origin, metres."""
@@ -84,6 +87,19 @@ class WindowGaussian:
         return out.reshape(len(times) * J * 3, -1)
 
 
+class WindowSummary(NamedTuple):
+    """Floor and usualness of the most probable mode of a window.
+
+    ``floor`` is its height, metres. ``posture``, ``surprise`` and ``proportions`` are mean squares
+    of standardised coefficients of the mean posture, of the motion and of bone lengths.
+    """
+
+    floor: float
+    posture: float
+    surprise: float
+    proportions: float
+
+
 @dataclass(frozen=True, eq=False)
 class WindowPosterior:
     """Mixture of modes of one window.
@@ -106,6 +122,17 @@ class WindowPosterior:
     def best(self) -> WindowMode:
         """The most probable mode."""
         return max(self.modes, key=lambda mode: mode.score)
+
+    @property
+    def summary(self) -> WindowSummary:
+        """Floor and usualness of the most probable mode."""
+        best, bones = self.best, len(self.prior.children)
+        return WindowSummary(
+            float(self.origin[1] + self.floor(best)),
+            best.posture,
+            float(best.scale * (best.mean[:-bones] ** 2).mean()),
+            float((best.mean[-bones:] ** 2).mean()),
+        )
 
     def floor(self, mode: WindowMode) -> float:
         """Return the height of the floor relative to the window's origin, metres."""

@@ -6,7 +6,6 @@ from .accuracy import (
     joint_errors as joint_errors,
 )
 from .chains import chain_diagnostics as chain_diagnostics
-from .credible_sets import credible_level as credible_level
 from .distribution import (
     mean_error as mean_error,
     precision_recall as precision_recall,
@@ -36,5 +35,9 @@ from .two_sample import (
     discrepancy_p_value as discrepancy_p_value,
     maximum_mean_discrepancy as maximum_mean_discrepancy,
 )
-from .uniformity import ecdf_band as ecdf_band, uniformity_p_value as uniformity_p_value
+from .uniformity import (
+    credible_level as credible_level,
+    ecdf_band as ecdf_band,
+    uniformity_p_value as uniformity_p_value,
+)
 from .verdict import Verdict as Verdict, judge as judge

@@ -53,7 +53,9 @@ def chain_diagnostics(draws: MotionDraws, values: np.ndarray | None = None) -> d
         tails = array_stats.ess(values, method="tail", prob=(0.05, 0.95), **axes)
         diagnostics["ess_tail"] = float(np.min(tails))
     if n_chains > 1 or "autocorrelation_time" not in data:
-        diagnostics["rhat"] = float(np.max(array_stats.rhat(values, **axes)))
+        # Infinite if no chain moves.
+        with np.errstate(divide="ignore"):
+            diagnostics["rhat"] = float(np.max(array_stats.rhat(values, **axes)))
     if "acceptance_rate" in data:
         diagnostics["acceptance"] = float(data["acceptance_rate"].mean())
     if "diverging" in data:

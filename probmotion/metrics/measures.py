@@ -27,10 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = ["accuracy_of", "load_libraries", "measure", "visible_joints"]
 
-_LIBRARIES = (
-    "arviz_stats.base", "scipy.spatial.distance", "sklearn.decomposition",
-    "sklearn.model_selection", "sklearn.svm",
-)  # fmt: skip
+_LIBRARIES = ("arviz_stats.base", "scipy.spatial.distance")
 
 _DIRECTIONS = 256  # of the sliced Wasserstein distance
 # Target number of exact draws, and maximum number of sets of exact draws, each as large as a run.

@@ -15,7 +15,11 @@ from probmotion import seeds
 from probmotion.interaction.geometry.coordinates import align_motions
 from probmotion.metrics import distribution
 from probmotion.metrics.chains import rhat_of_independent
-from probmotion.metrics.two_sample import accuracy_sd, classifier_two_sample
+from probmotion.metrics.two_sample import (
+    accuracy_sd,
+    classifier_two_sample,
+    principal_components,
+)
 from probmotion.posteriors.draws import MotionDraws
 from probmotion.posteriors.problem import Problem
 from probmotion.posteriors.protocols import HasManifold, HasStyles
@@ -225,12 +229,10 @@ class _Reference:
 
 @lru_cache(maxsize=4)
 def _reference(problem: Problem, seed: int) -> _Reference:
-    from sklearn.decomposition import PCA
-
     draws = reference_draws(problem, seed)
     flat = draws.flat
     chosen, held_out = np.split(flat, [int(_DIRECTION_FRACTION * len(flat))])
-    directions = PCA(min(_N_LEADING, *chosen.shape), random_state=0).fit(chosen).components_
+    _, directions = principal_components(chosen, min(_N_LEADING, *chosen.shape))
     projected = held_out @ directions.T
     mean, sd = projected.mean(axis=0), projected.std(axis=0, ddof=1)
     return _Reference(

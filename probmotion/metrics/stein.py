@@ -105,7 +105,8 @@ def _score(posterior: MotionPosterior, theta: np.ndarray) -> np.ndarray:
             raise NoGradient(f"posterior must be differentiable: {error}") from error
         except Exception as cause:
             # Densities may raise any exception for unsupported arrays.
-            reasons.append(f"{name} raised {type(cause).__name__}")
+            is_missing = isinstance(cause, ModuleNotFoundError)
+            reasons.append(str(cause) if is_missing else f"{name} raised {type(cause).__name__}")
     raise NoGradient(
         f"posterior must be differentiable, got {_kind(posterior.prior)} with "
         f"{_kind(posterior.likelihood)}: {' and '.join(reasons)}"
@@ -113,7 +114,7 @@ def _score(posterior: MotionPosterior, theta: np.ndarray) -> np.ndarray:
 
 
 def _torch_gradient(posterior: MotionPosterior, theta: np.ndarray) -> np.ndarray:
-    import torch
+    from probmotion.extras import torch
 
     point = torch.tensor(theta, requires_grad=True)
     # Rows are independent: the gradient of their sum contains each row's gradient.
@@ -122,7 +123,7 @@ def _torch_gradient(posterior: MotionPosterior, theta: np.ndarray) -> np.ndarray
 
 
 def _jax_gradient(posterior: MotionPosterior, theta: np.ndarray) -> np.ndarray:
-    import jax
+    from probmotion.extras import jax
 
     def total(point: Any) -> Any:
         return posterior.log_density(point).sum()

@@ -8,8 +8,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from scipy import linalg
 
 from probmotion import seeds
+from probmotion.metrics.support_vectors import cross_validated_accuracy
 from probmotion.validation import check_count, check_finite, check_positive, check_shape
 
 __all__ = [
@@ -18,6 +20,7 @@ __all__ = [
     "discrepancy_p_value",
     "maximum_mean_discrepancy",
     "median_distance",
+    "principal_components",
     "principal_coordinates",
     "squared_distances",
 ]
@@ -25,6 +28,9 @@ __all__ = [
 _FOLDS = 5  # of cross-validation
 _MAX_COORDINATES, _POINTS_PER_COORDINATE = 40, 10  # maximum features, minimum points per feature
 _ROUNDING = 1e-9  # relative rounding error
+# Principal components: largest sizes for the covariance and for exact singular vectors, and
+# number of additional directions of the randomised subspace.
+_MAX_DIM_OF_COVARIANCE, _MAX_SIZE_OF_SVD, _OVERSAMPLING = 1000, 500, 10
 
 
 def squared_distances(points: np.ndarray, centre: np.ndarray | None = None) -> np.ndarray:
@@ -32,10 +38,14 @@ def squared_distances(points: np.ndarray, centre: np.ndarray | None = None) -> n
 
     Distances are most precise close to ``centre`` (D,), by default the mean of the points.
     """
-    from sklearn.metrics import euclidean_distances
-
-    centre = points.mean(axis=0) if centre is None else centre
-    return euclidean_distances(points - centre, squared=True)
+    x = points - (points.mean(axis=0) if centre is None else centre)
+    squares = np.einsum("nd,nd->n", x, x)
+    distances = -2 * (x @ x.T)
+    distances += squares[:, None]
+    distances += squares
+    np.maximum(distances, 0, out=distances)
+    np.fill_diagonal(distances, 0)
+    return distances
 
 
 def median_distance(points: np.ndarray) -> float:
@@ -109,9 +119,10 @@ def discrepancy_p_value(
 def classifier_two_sample(draws: np.ndarray, reference: np.ndarray, seed: int) -> float:
     """Return the accuracy of the classifier two-sample test (C2ST): 0.5 is ideal, 1 is worst.
 
-    The classifier is a support vector machine with a Gaussian kernel and scikit-learn's defaults;
-    accuracy is 5-fold cross-validated (Lopez-Paz and Oquab 2017, section 3). For exact draws, it
-    has mean .5 and standard deviation about 1/√(8n), which is .025 at n = 200.
+    The classifier is a support vector machine with a Gaussian kernel
+    (:mod:`~probmotion.metrics.support_vectors`); accuracy is 5-fold cross-validated (Lopez-Paz and
+    Oquab 2017, section 3). For exact draws, it has mean .5 and standard deviation about 1/√(8n),
+    which is .025 at n = 200.
 
     Features are the n/5, at most 40, leading :func:`principal_coordinates` of both sets together.
 
@@ -122,9 +133,6 @@ def classifier_two_sample(draws: np.ndarray, reference: np.ndarray, seed: int) -
     seed : int
         Seed of the folds.
     """
-    from sklearn.model_selection import StratifiedKFold, cross_val_score
-    from sklearn.svm import SVC
-
     _check_sets(draws, reference)
     check_shape("reference", reference, draws.shape)
     if len(draws) < _FOLDS:
@@ -133,9 +141,7 @@ def classifier_two_sample(draws: np.ndarray, reference: np.ndarray, seed: int) -
     size = min(_MAX_COORDINATES, len(pooled) // _POINTS_PER_COORDINATE)
     features = principal_coordinates(pooled, max(1, size))
     labels = np.repeat([0, 1], len(draws))
-    random_state = seeds.integer(seed, "folds") % 2**32
-    folds = StratifiedKFold(_FOLDS, shuffle=True, random_state=random_state)
-    return float(cross_val_score(SVC(), features, labels, cv=folds).mean())
+    return cross_validated_accuracy(features, labels, _FOLDS, seeds.integer(seed, "folds") % 2**32)
 
 
 def accuracy_sd(n: int) -> float:
@@ -154,13 +160,11 @@ def principal_coordinates(points: np.ndarray, max_coordinates: int) -> np.ndarra
     Returns up to ``max_coordinates`` leading coordinates and, if the points have more dimensions,
     the log squared distance from their subspace, to detect errors off the manifold.
     """
-    from sklearn.decomposition import PCA
-
     if (points == points[0]).all():
         raise ValueError(f"points must differ, got {len(points)} equal points")
     centred = points - points.mean(axis=0)
     size = min(max_coordinates, *centred.shape)
-    coordinates = PCA(size, random_state=0).fit_transform(centred)
+    coordinates, _ = principal_components(centred, size)
     sizes = coordinates.std(axis=0)
     coordinates = coordinates[:, sizes > _ROUNDING * sizes[0]]
     features = coordinates / coordinates.std(axis=0)
@@ -169,6 +173,50 @@ def principal_coordinates(points: np.ndarray, max_coordinates: int) -> np.ndarra
         return features
     errors = np.log(errors)
     return np.column_stack([features, (errors - errors.mean()) / errors.std()])
+
+
+def principal_components(points: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return coordinates along the k directions of largest variance, and the directions.
+
+    ``(n, D) → (n, k), (k, D)``. The largest entry of a direction is positive. Large matrices are
+    decomposed by randomised subspace iteration (Halko, Martinsson and Tropp 2011, "Finding
+    structure with randomness", algorithms 4.4 and 5.1), with the settings of scikit-learn.
+    """
+    n, dim = points.shape
+    mean = points.mean(axis=0)
+    if dim <= _MAX_DIM_OF_COVARIANCE and n >= 10 * dim:
+        covariance = (points.T @ points - n * mean[:, None] * mean) / (n - 1)
+        directions = np.linalg.eigh(covariance)[1][:, : -k - 1 : -1].T
+        directions = directions * _signs(directions)[:, None]
+        return points @ directions.T - mean @ directions.T, directions
+    centred = points - mean
+    if max(n, dim) <= _MAX_SIZE_OF_SVD or k >= 0.8 * min(n, dim):
+        left, values, right = linalg.svd(centred, full_matrices=False)
+    else:
+        left, values, right = _randomised_svd(centred, k)
+    left, values, right = left[:, :k], values[:k], right[:k]
+    signs = _signs(right)
+    return left * signs * values, right * signs[:, None]
+
+
+def _signs(directions: np.ndarray) -> np.ndarray:
+    """Return the signs of the largest entries of directions, ``(k, D) → (k,)``."""
+    largest = np.abs(directions).argmax(axis=1)
+    return np.sign(directions[np.arange(len(directions)), largest])
+
+
+def _randomised_svd(points: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return approximate singular vectors and values, at least k."""
+    n, dim = points.shape
+    tall = points if n >= dim else points.T
+    subspace = np.random.RandomState(0).normal(size=(tall.shape[1], k + _OVERSAMPLING))
+    for _ in range(7 if k < 0.1 * min(n, dim) else 4):
+        subspace, _ = linalg.lu(tall @ subspace, permute_l=True, check_finite=False)
+        subspace, _ = linalg.lu(tall.T @ subspace, permute_l=True, check_finite=False)
+    basis, _ = linalg.qr(tall @ subspace, mode="economic", check_finite=False)
+    left, values, right = linalg.svd(basis.T @ tall, full_matrices=False)
+    left = basis @ left
+    return (left, values, right) if n >= dim else (right.T, values, left.T)
 
 
 def _kernel(squared: np.ndarray, length_scale: float) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Test of uniformity on [0, 1] with simultaneous bands of the empirical distribution function.
+"""Ranks on [0, 1]: levels of credible sets, and a test of uniformity with simultaneous bands.
 
 Source: Säilynoja, Bürkner & Vehtari (2022), "Graphical test for discrete uniformity and its
 applications in goodness-of-fit evaluation and multiple sample comparison", section 3. The
@@ -15,12 +15,35 @@ from scipy.stats import poisson
 
 from probmotion.validation import check_count, check_finite, check_shape
 
-__all__ = ["adjusted_p_values", "ecdf_band", "evaluation_points", "uniformity_p_value"]
+__all__ = [
+    "DENSITY",
+    "DISTANCE",
+    "adjusted_p_values",
+    "credible_level",
+    "ecdf_band",
+    "evaluation_points",
+    "uniformity_p_value",
+]
+
+# Quantities whose credible sets are not central intervals.
+DENSITY, DISTANCE = "log density", "distance"
 
 _MAX_POINTS = 100  # maximum number of evaluation points, plus 1
 # Tolerance of comparisons of tail probabilities: those equal by symmetry differ by rounding.
 _TOLERANCE = 1 + 1e-9
 _BISECTIONS = 40  # bisection steps
+
+
+def credible_level(quantity: str, ranks: np.ndarray) -> np.ndarray:
+    """Return the level of the smallest credible set that contains the truth of rank in [0, 1].
+
+    The set is a highest-density region for :data:`DENSITY` (Hermans et al. 2022, "A crisis in
+    simulation-based inference?"), a ball around a random point for :data:`DISTANCE` (Lemos et al.
+    2023, "Sampling-based accuracy testing of posterior estimators") and else a central interval.
+    """
+    if quantity == DENSITY:
+        return 1 - ranks
+    return ranks if quantity == DISTANCE else np.abs(2 * ranks - 1)
 
 
 def evaluation_points(n: int) -> np.ndarray:

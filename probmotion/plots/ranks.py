@@ -150,7 +150,7 @@ def _draw_difference(
 
 
 def _draw_coverage(axes: Axes, ranks: Mapping[str, np.ndarray], colours: Mapping[str, str]) -> None:
-    from probmotion.metrics.credible_sets import DENSITY, DISTANCE, credible_level
+    from probmotion.metrics.uniformity import DENSITY, DISTANCE, credible_level
 
     for n in {len(values) for values in ranks.values()}:
         _draw_band(axes, n, less=0)

@@ -50,7 +50,7 @@ def available_problems() -> tuple[list[str], dict[str, str]]:
     for name in problem_names():
         try:
             load_problem(name)
-        except FileNotFoundError as error:
+        except (FileNotFoundError, ModuleNotFoundError) as error:
             missing[name] = str(error)
     return [name for name in problem_names() if name not in missing], missing
 
@@ -80,6 +80,8 @@ def load_problem(name: str, **scale: Any) -> Problem:
         another posterior.
     FileNotFoundError
         If the problem's data are missing; the message explains how to obtain them.
+    ModuleNotFoundError
+        If the problem requires an extra of this package; the message names it.
     """
     return _load(*_resolve(name, scale))
 

@@ -52,7 +52,7 @@ def coordinate_distillation_gradient(
 
 def _likelihood_gradient(posterior: MotionPosterior, theta: np.ndarray) -> np.ndarray:
     """Return ∇ log p(y | θ), ``(n, dim) → (n, dim)``."""
-    import torch
+    from probmotion.extras import torch
 
     # Copy θ because Adam updates it in place.
     point = torch.tensor(theta, requires_grad=True)

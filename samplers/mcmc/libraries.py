@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from probmotion.samplers.mcmc.function import SamplingFunction, TargetDensity
-from probmotion.validation import import_extra
 
 __all__ = ["blackjax_kernel", "emcee_sampler", "flowmc_sampler", "numpyro_kernel"]
 
@@ -39,7 +38,7 @@ def blackjax_kernel(
     def blackjax(
         log_density: TargetDensity, dim: int, rng: np.random.Generator, draws: int
     ) -> np.ndarray:
-        import jax
+        from probmotion.extras import jax
 
         with jax.enable_x64(True):
             kernel = algorithm(log_density)
@@ -81,11 +80,10 @@ def numpyro_kernel(
     def numpyro(
         log_density: TargetDensity, dim: int, rng: np.random.Generator, draws: int
     ) -> np.ndarray:
-        import jax
-        from numpyro.infer import MCMC
+        from probmotion.extras import jax, numpyro
 
         with jax.enable_x64(True):
-            chain = MCMC(
+            chain = numpyro.infer.MCMC(
                 kernel(lambda theta: -log_density(theta)),
                 num_warmup=warmup,
                 num_samples=draws,
@@ -165,9 +163,9 @@ def flowmc_sampler(bundle: Any, *, walkers: int = 20, **settings: Any) -> Sampli
     def flowmc(
         log_density: TargetDensity, dim: int, rng: np.random.Generator, draws: int
     ) -> np.ndarray:
-        import jax
+        from flowMC.Sampler import Sampler
 
-        library = import_extra("flowMC.Sampler", "flowmc")
+        from probmotion.extras import jax
 
         def target(theta: Any, data: Any) -> Any:
             return log_density(theta)
@@ -177,7 +175,7 @@ def flowmc_sampler(bundle: Any, *, walkers: int = 20, **settings: Any) -> Sampli
         with jax.enable_x64(True):
             keys = jax.random.split(jax.random.key(_integer(rng)))
             built = bundle(keys[0], walkers, dim, target, n_production_loops=loops, **settings)
-            sampler = library.Sampler(
+            sampler = Sampler(
                 n_dim=dim,
                 n_chains=walkers,
                 rng_key=keys[1],

@@ -94,7 +94,7 @@ class NUTS:
         Interrupted
             On Ctrl-C, with the finished draws.
         """
-        import jax
+        from probmotion.extras import jax
 
         check_count("draws", draws)
         require(self, posterior)

@@ -36,19 +36,19 @@ class NutsKernel:
     def __init__(
         self, posterior: MotionPosterior, warmup: int, target_acceptance: float, max_tree_depth: int
     ) -> None:
-        import jax
-        from numpyro.infer import NUTS as Kernel  # noqa: N811
+        from probmotion.extras import jax, numpyro
 
         to_jax = _to_jax(posterior)
         log_density = to_jax(posterior.log_density)
         self.warmup = warmup
-        self.kernel = Kernel(
+        self.kernel = numpyro.infer.NUTS(
             potential_fn=lambda theta: -log_density(theta),
             target_accept_prob=target_acceptance,
             max_tree_depth=max_tree_depth,
         )
         # Not compiled, because it is evaluated once per chain.
         self.value_and_gradient = jax.value_and_grad(lambda theta: -log_density(theta))
+        self.log_density = jax.jit(log_density)
         self.log_likelihood = jax.jit(to_jax(posterior.log_likelihood))
         self.advance = jax.jit(self._advance)
         # Compile all functions now to exclude compilation from measured run times.
@@ -68,7 +68,7 @@ class NutsKernel:
 
     def log_densities(self, theta: np.ndarray) -> np.ndarray:
         """Return the log density: ``(n, dim) → (n,)``."""
-        return np.array([-float(self.value_and_gradient(point)[0]) for point in theta])
+        return np.array([float(self.log_density(point)) for point in theta])
 
     def log_likelihoods(self, theta: np.ndarray) -> np.ndarray:
         """Return log p(y | θ): ``(n, dim) → (n,)``."""
@@ -76,7 +76,7 @@ class NutsKernel:
 
     def restore(self, leaves: list[np.ndarray], theta: np.ndarray) -> Any:
         """Return the state with the given :meth:`leaves`, without evaluating the density."""
-        import jax
+        from probmotion.extras import jax
 
         template = self._init(jax.random.key(0), theta, 0.0, np.zeros_like(theta))
         shapes, structure = jax.tree.flatten(template)
@@ -90,7 +90,7 @@ class NutsKernel:
 
     def leaves(self, state: Any) -> list[np.ndarray]:
         """Return a state as a list of arrays that netCDF can store."""
-        import jax
+        from probmotion.extras import jax
 
         out = []
         for leaf in jax.tree.leaves(state):
@@ -101,16 +101,19 @@ class NutsKernel:
         return out
 
     def _init(self, key: Any, theta: np.ndarray, potential: Any, gradient: Any) -> Any:
-        import jax.numpy as jnp
-        from numpyro.infer.util import ParamInfo
+        from probmotion.extras import jax, numpyro
 
-        start = ParamInfo(jnp.asarray(theta), jnp.asarray(potential), jnp.asarray(gradient))
+        jnp = jax.numpy
+        start = numpyro.infer.util.ParamInfo(
+            jnp.asarray(theta), jnp.asarray(potential), jnp.asarray(gradient)
+        )
         return self.kernel.init(key, self.warmup, start)
 
     def _advance(self, state: Any, draws: Any, thin: Any) -> tuple[Any, dict[str, Any]]:
         """Return the state after ``draws`` ≤ CHUNK draws, and arrays of draws with CHUNK rows."""
-        import jax
-        import jax.numpy as jnp
+        from probmotion.extras import jax
+
+        jnp = jax.numpy
 
         def iteration(_: Any, carry: tuple[Any, Any, Any, Any]) -> Any:
             state, accepted, diverging, steps = carry
@@ -152,7 +155,7 @@ def _to_jax(
 
     Raises :class:`UnsupportedPosterior` if neither JAX nor torch can differentiate the density.
     """
-    import jax
+    from probmotion.extras import jax
 
     point = jax.ShapeDtypeStruct((posterior.dim,), np.float64)
     try:

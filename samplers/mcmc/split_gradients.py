@@ -55,7 +55,7 @@ def split_gradient(posterior: MotionPosterior) -> SplitGradient | None:
 
 
 def _jax_gradient(parts: Sequence[Callable[[Array], Array]]) -> SplitGradient:
-    import jax
+    from probmotion.extras import jax
 
     def evaluate(theta: Any) -> list[Any]:
         values, gradients = [], []
@@ -76,7 +76,7 @@ def _jax_gradient(parts: Sequence[Callable[[Array], Array]]) -> SplitGradient:
 
 
 def _torch_gradient(parts: Sequence[Callable[[Array], Array]]) -> SplitGradient:
-    import torch
+    from probmotion.extras import torch
 
     def block(theta: np.ndarray) -> list[np.ndarray]:
         point = torch.tensor(theta, dtype=torch.float64, requires_grad=True)

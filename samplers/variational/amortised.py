@@ -11,10 +11,9 @@ from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
-import torch
-from torch import nn
 
 from probmotion import seeds
+from probmotion.extras import nn, torch
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.sampling import progress_bar
 from probmotion.samplers.variational.amortised_network import ConditionalVAE

@@ -9,8 +9,7 @@ network. Training maximises E[log N(x; μ, S) − KL(r ‖ p)] (Sohn, Lee and Ya
 
 from __future__ import annotations
 
-import torch
-from torch import nn
+from probmotion.extras import nn, torch
 
 __all__ = ["ConditionalVAE"]
 

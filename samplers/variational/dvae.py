@@ -27,7 +27,6 @@ from probmotion.posteriors.protocols import (
 )
 from probmotion.posteriors.sampling import UnsupportedPosterior, progress_bar
 from probmotion.samplers.independent import Batches, IndependentSampler
-from probmotion.samplers.variational.amortised import AmortisedPosterior, AmortisedSettings
 from probmotion.samplers.variational.simulated_pairs import observed_entries
 from probmotion.seeds import NormalStreams
 from probmotion.threads import one_thread
@@ -197,6 +196,11 @@ class DVAEInference(IndependentSampler):
             return lambda streams: prior.sample(streams, len(streams.generators))  # type: ignore[arg-type]
         network = self._network_of(posterior)
         if network is None:
+            from probmotion.samplers.variational.amortised import (
+                AmortisedPosterior,
+                AmortisedSettings,
+            )
+
             settings = AmortisedSettings(steps=self.training_steps, pairs=self.training_pairs)
             counts["gradient"] += self.training_steps
             return AmortisedPosterior.fit(posterior, settings, seed, progress).draw
@@ -257,7 +261,7 @@ class DVAEInference(IndependentSampler):
         self, inference: MotionInference, seed: int, counts: dict[str, int], progress: bool
     ) -> list[float]:
         """Optimise and return all losses; the last loss uses the random numbers of the first."""
-        import torch
+        from probmotion.extras import torch
 
         parameters = inference.parameters()
         adam = torch.optim.Adam(parameters, lr=self.learning_rate)

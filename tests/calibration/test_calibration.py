@@ -21,8 +21,7 @@ from probmotion.calibration.ranks import independent_draws, rank
 from probmotion.calibration.result import Calibration
 from probmotion.calibration.table import LEVELS, coverage_curve
 from probmotion.comparison import Budget
-from probmotion.metrics.credible_sets import DENSITY, DISTANCE
-from probmotion.metrics.uniformity import uniformity_p_value
+from probmotion.metrics.uniformity import DENSITY, DISTANCE, uniformity_p_value
 from probmotion.posteriors.problem import Problem, simulated
 from probmotion.posteriors.sampling import Interrupted
 from probmotion.problems.observations import observe

@@ -16,7 +16,7 @@ from probmotion.models.evaluation.lifter import PoseLifter
 
 PERSON = Skeleton.preset("person14")
 KINDS = ("diffusion", "evaluator", "lifter", "dvae", "denoiser", "motion-vae")
-FILES = {"losses.csv", "model.safetensors", "state.safetensors"}
+FILES = {".lock", "losses.csv", "model.safetensors", "state.safetensors"}
 PARTS = ["--validation", "walk3", "--test", "walk4"]
 
 

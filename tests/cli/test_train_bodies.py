@@ -21,7 +21,7 @@ from probmotion.models.dvae.motion_dvae import MotionDVAE
 from probmotion.models.dvae.training import usual_dvae_training
 
 PERSON = Skeleton.preset("person14")
-FILES = {"losses.csv", "model.safetensors", "state.safetensors"}
+FILES = {".lock", "losses.csv", "model.safetensors", "state.safetensors"}
 PARTS = ["--validation", "walk3", "--test", "walk4"]
 
 

@@ -269,3 +269,10 @@ def test_several_views_of_a_balancing_person_agree_with_the_triangulation(real_d
     recording = read_recording(path, fps=None)
     distance = np.linalg.norm(result.mean.positions - recording.filtered, axis=-1)[:, SEEN]
     assert np.nanmean(distance) < 0.035
+
+
+def test_the_page_names_the_camera_whose_view_it_shows(three, tmp_path):
+    seen = (three.weight > 0).sum(axis=(1, 2))
+    text = three.report(tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "<h1>3D motion from 3 cameras</h1>" in text  # tracks are named after the cameras
+    assert f"keypoints are those of {three.camera_names[seen.argmax()]}<" in text

@@ -73,6 +73,13 @@ def test_a_camera_that_looks_down_is_found():
     assert np.degrees(result.camera.pitch) == pytest.approx(true, abs=6)
 
 
+def test_a_pitch_that_several_starts_reach_counts_once(video, lifted, monkeypatch):
+    starts = np.radians([-20.0, 0.0, 20.0, 20.0, 20.0, 20.0])
+    monkeypatch.setattr("probmotion.lifting.track_lift._PITCHES", starts)
+    again = lift(video.track, image_size=video.size, progress=False, draws=2)
+    assert again.camera.pitch == pytest.approx(lifted.camera.pitch, abs=1e-9)
+
+
 def test_a_given_pitch_is_kept(video, lifted):
     # The made camera is at 1.4 m and looks at a point 1 m above the floor.
     distance = np.linalg.norm(video.motion.positions[:, 0, [0, 2]], axis=-1).mean()

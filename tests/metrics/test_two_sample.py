@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 from scipy import stats
+from sklearn.decomposition import PCA
 
 from probmotion.metrics.two_sample import (
     accuracy_sd,
@@ -13,6 +14,7 @@ from probmotion.metrics.two_sample import (
     discrepancy_p_value,
     maximum_mean_discrepancy,
     median_distance,
+    principal_components,
     principal_coordinates,
     squared_distances,
 )
@@ -160,3 +162,15 @@ SAME = np.zeros((8, 3))
 def test_invalid_arguments(test, draws, reference, message):
     with pytest.raises(ValueError, match=message):
         test(draws, reference)
+
+
+@pytest.mark.parametrize(
+    ("n", "dim", "k"), [(40, 9, 9), (300, 20, 3), (600, 510, 20), (200, 700, 8), (700, 90, 80)]
+)
+def test_principal_components_are_those_of_scikit_learn(n, dim, k, rng):
+    scales = np.geomspace(1, 0.01, dim)
+    points = 3 + (rng.normal(size=(n, dim)) * scales) @ stats.ortho_group.rvs(dim, random_state=rng)
+    oracle = PCA(k, random_state=0)
+    coordinates, directions = principal_components(points, k)
+    np.testing.assert_allclose(coordinates, oracle.fit_transform(points), atol=1e-10)
+    np.testing.assert_allclose(directions, oracle.components_, atol=1e-10)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -12,6 +13,7 @@ import pytest
 import xarray as xr
 
 from probmotion import MotionDraws, MotionPosterior, Skeleton
+from probmotion.posteriors.draws import library_versions
 
 CHAINS, DRAWS, FRAMES, DIM = 2, 5, 3, 4
 CHAIN = Skeleton(["Hüfte・腰", "knee"], [-1, 0], [0.05, 0.04])
@@ -154,3 +156,15 @@ BROKEN[1, 2, 0, 0, 0] = np.nan
 def test_invalid_arguments(changes, message):
     with pytest.raises(ValueError, match=message):
         some_draws(**changes)
+
+
+def test_versions_are_those_of_installed_packages(monkeypatch):
+    def without_torch(package):
+        if package == "torch":
+            raise PackageNotFoundError(package)
+        return version(package)
+
+    monkeypatch.setattr("probmotion.posteriors.draws.version", without_torch)
+    every = library_versions.__wrapped__()
+    assert library_versions().keys() - every.keys() == {"torch"}
+    assert every["numba"] == version("numba")

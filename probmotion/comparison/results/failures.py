@@ -10,9 +10,12 @@ from probmotion.posteriors.sampling import UnsupportedPosterior
 from probmotion.validation import check_types
 
 __all__ = [
-    "Failure", "NonFiniteDraws", "ResultNotWritten", "TimeLimitExceeded", "WorkerDied",
-    "read_failure",
+    "NOT_INSTALLED", "Failure", "NonFiniteDraws", "ResultNotWritten", "TimeLimitExceeded",
+    "WorkerDied", "read_failure",
 ]  # fmt: skip
+
+NOT_INSTALLED = "not installed"
+"""Word of failures for lack of an optional library."""
 
 # Class names and messages of out-of-memory errors other than MemoryError.
 _MEMORY_KINDS = ("OutOfMemoryError",)
@@ -54,9 +57,9 @@ class Failure:
     Parameters
     ----------
     word : str
-        Reason in one word: ``memory``, ``time``, ``nan``, ``died``, the word of an
-        :class:`~probmotion.posteriors.sampling.UnsupportedPosterior` such as ``budget``, or the
-        class of the error.
+        Reason in one or two words: ``memory``, ``time``, ``nan``, ``died``, ``not installed``, the
+        word of an :class:`~probmotion.posteriors.sampling.UnsupportedPosterior` such as ``budget``,
+        or the class of the error.
     message : str
         Error message on one line.
     unsupported : bool
@@ -98,6 +101,8 @@ def _word(error: BaseException, message: str) -> str:
         return "memory"
     if isinstance(error, WorkerDied):
         return "died"
+    if isinstance(error, ModuleNotFoundError):
+        return NOT_INSTALLED
     if isinstance(error, NonFiniteDraws | FloatingPointError):
         return "nan"
     # Raised by MotionDraws, densities and gradients.

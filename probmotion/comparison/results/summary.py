@@ -10,6 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
+from probmotion.comparison.results.failures import NOT_INSTALLED
 from probmotion.comparison.results.headline_metrics import HEADLINE_METRICS
 from probmotion.comparison.results.plan import Plan
 from probmotion.comparison.results.run_results import RunResult
@@ -197,9 +198,11 @@ def _reasons(results: Judged) -> Iterator[str]:
     failed: dict[tuple[str, str], dict[str, None]] = {}
     for run in results.results:
         if run.failure is not None and not run.failure.unsupported:
-            failed.setdefault((run.problem, run.failure.message), {})[run.sampler] = None
-    for (problem, message), samplers in list(failed.items())[:_MAX_REASONS]:
-        yield shorten(f"{_listed(samplers)} on {problem}: {message}", _WIDTH, placeholder=" …")
+            # Libraries are missing on every problem.
+            where = "" if run.failure.word == NOT_INSTALLED else f" on {run.problem}"
+            failed.setdefault((where, run.failure.message), {})[run.sampler] = None
+    for (where, message), samplers in list(failed.items())[:_MAX_REASONS]:
+        yield shorten(f"{_listed(samplers)}{where}: {message}", _WIDTH, placeholder=" …")
     if len(failed) > _MAX_REASONS:
         yield f"and {len(failed) - _MAX_REASONS} more failures, see failures.json"
 

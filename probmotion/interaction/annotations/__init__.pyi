@@ -6,7 +6,11 @@ from .backbones import (
 )
 from .local_frames import pair_frames as pair_frames
 from .sources import DrawnAnnotations as DrawnAnnotations, draw_annotations as draw_annotations
-from .tracks import annotations_of_tracks as annotations_of_tracks
+from .tracks import (
+    annotations_of_keypoints as annotations_of_keypoints,
+    annotations_of_tracks as annotations_of_tracks,
+    keypoints_of_tracks as keypoints_of_tracks,
+)
 from .views import (
     ViewDistribution as ViewDistribution,
     project_to_views as project_to_views,

@@ -22,10 +22,16 @@ from probmotion.motion.motion import KeypointTrack
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_positive
 
-__all__ = ["annotations_of_tracks"]
+__all__ = [
+    "annotations_of_keypoints",
+    "annotations_of_tracks",
+    "keypoints_of_tracks",
+    "running_median",
+]
 
 _TRUNK = ("pelvis", "spine", "chest", "neck")
-_FULL_LENGTH = 0.95  # quantile of a bone's projected length used as its 3D length
+_FULL_LENGTH = 0.9  # quantile of a bone's projected length used as its 3D length
+_STEADY = 0.12  # half the length of running medians and means of bones, seconds
 
 
 def annotations_of_tracks(
@@ -39,20 +45,48 @@ def annotations_of_tracks(
 
     Parameters
     ----------
+    tracks, seed, metres_per_pixel, least_confidence
+        As for :func:`keypoints_of_tracks`.
+
+    Returns
+    -------
+    annotations : Annotations
+        Annotations; ``dropped`` counts the frames in which a person has no visible joint.
+    """
+    keypoints = keypoints_of_tracks(
+        tracks, seed, metres_per_pixel=metres_per_pixel, least_confidence=least_confidence
+    )
+    return annotations_of_keypoints(keypoints, tracks[0].fps, tracks[0].name)
+
+
+def keypoints_of_tracks(
+    tracks: Sequence[KeypointTrack],
+    seed: np.ndarray,
+    *,
+    metres_per_pixel: float | None = None,
+    least_confidence: float = 0.3,
+) -> np.ndarray:
+    """Return the keypoints of ``pair17`` in every frame, (L, J, 2), metres, y up.
+
+    Joints that are not visible are NaN.
+
+    Parameters
+    ----------
     tracks : sequence of KeypointTrack
         One track per person, in the order of the seed, over the same frames.
     seed : ndarray, (J, 3)
         Pose-pair of ``pair17``, metres; defines bone lengths and the positions of trunk joints.
     metres_per_pixel : float, optional
         Scale of the image. Default: the median over limb bones of the bone's length in the seed
-        divided by the 95 % quantile of its length in the image.
+        divided by the 90 % quantile of its length in the image, steadied over time.
     least_confidence : float
         Minimum confidence; keypoints below it count as occluded.
 
-    Returns
-    -------
-    annotations : Annotations
-        Annotations; ``dropped`` counts the frames in which a person has no visible joint.
+    Raises
+    ------
+    ValueError
+        If tracks are not two of equal length and rate, lack limb keypoints, or never show both
+        people in one frame.
     """
     skeleton, person = Skeleton.preset("pair17"), Skeleton.preset("person17")
     seed = np.asarray(seed, dtype=np.float64)
@@ -74,26 +108,50 @@ def annotations_of_tracks(
         axis=1,
     )
     keypoints *= [1.0, -1.0]  # y up
-    visible = np.isfinite(keypoints).all(axis=-1)
-    complete = visible.reshape(len(visible), len(tracks), -1).any(axis=-1).all(axis=-1)
-    if not complete.any():
+    if not _shows_all(keypoints).any():
         raise ValueError(
             f"tracks must have a frame in which all {len(tracks)} people are visible, got none"
         )
     if metres_per_pixel is None:
-        metres_per_pixel = _scale(keypoints, seed, skeleton)
+        metres_per_pixel = _scale(keypoints, seed, skeleton, tracks[0].fps)
     check_positive("metres_per_pixel", metres_per_pixel)
-    keypoints *= metres_per_pixel
+    return keypoints * metres_per_pixel
+
+
+def annotations_of_keypoints(keypoints: np.ndarray, fps: float, name: str = "") -> Annotations:
+    """Return the annotations of a video from keypoints (L, J, 2) of :func:`keypoints_of_tracks`.
+
+    ``name`` is the video's; ``dropped`` counts the frames in which a person has no visible joint.
+    """
+    complete = _shows_all(keypoints)
     padded = np.pad(keypoints, ((1, 1), (0, 0), (0, 0)), constant_values=np.nan)
     return Annotations(
         keypoints[complete],
-        visible[complete],
-        skeleton,
+        np.isfinite(keypoints).all(axis=-1)[complete],
+        Skeleton.preset("pair17"),
         np.stack([padded[:-2], padded[2:]], axis=1)[complete],
-        tracks[0].fps,
-        sources=[tracks[0].name] * int(complete.sum()),
+        fps,
+        sources=[name] * int(complete.sum()),
         dropped={"one person missing": int((~complete).sum())},
     )
+
+
+def running_median(values: np.ndarray, half: int) -> np.ndarray:
+    """Return medians over 2 ``half`` + 1 frames (axis 0), the lower one of two; NaN is ignored."""
+    ends = ((half, half), *((0, 0) for _ in values.shape[1:]))
+    padded = np.pad(values, ends, constant_values=np.nan)
+    windows = np.sort([padded[s : s + len(values)] for s in range(2 * half + 1)], axis=0)
+    middle = np.maximum((~np.isnan(windows)).sum(axis=0) - 1, 0) // 2
+    median: np.ndarray = np.take_along_axis(windows, middle[None], axis=0)[0]
+    return median
+
+
+def _shows_all(keypoints: np.ndarray) -> np.ndarray:
+    """Return a mask (L,) of the frames in which every person has a visible joint."""
+    people = len(Skeleton.preset("pair17").roots)
+    visible = np.isfinite(keypoints).all(axis=-1).reshape(len(keypoints), people, -1)
+    shown: np.ndarray = visible.any(axis=-1).all(axis=-1)
+    return shown
 
 
 def _person_joints(
@@ -146,14 +204,19 @@ def _head(joints: dict[str, np.ndarray]) -> np.ndarray:
     return head
 
 
-def _scale(keypoints: np.ndarray, seed: np.ndarray, skeleton: Skeleton) -> float:
-    """Return metres per pixel from the limbs' projected lengths."""
+def _scale(keypoints: np.ndarray, seed: np.ndarray, skeleton: Skeleton, fps: float) -> float:
+    """Return metres per pixel from the limbs' projected lengths.
+
+    Noise lengthens bones: they are first steadied by a running median and a running mean.
+    """
     parts = ("elbow", "wrist", "knee", "ankle")
+    half = round(_STEADY * fps)
     ratios = []
     for joint, parent in skeleton.bones:
         if not skeleton.joint_names[joint].endswith(parts):
             continue
-        lengths = np.linalg.norm(keypoints[:, joint] - keypoints[:, parent], axis=-1)
+        bones = running_median(keypoints[:, joint] - keypoints[:, parent], half)
+        lengths = np.linalg.norm(_running_mean(bones, half), axis=-1)
         lengths = lengths[np.isfinite(lengths)]
         longest = np.quantile(lengths, _FULL_LENGTH) if len(lengths) else 0.0
         if longest > 0:
@@ -161,3 +224,14 @@ def _scale(keypoints: np.ndarray, seed: np.ndarray, skeleton: Skeleton) -> float
     if not ratios:
         raise ValueError("tracks must have a visible limb bone, got none: pass metres_per_pixel")
     return float(np.median(ratios))
+
+
+def _running_mean(values: np.ndarray, half: int) -> np.ndarray:
+    """Return means over 2 ``half`` + 1 frames (axis 0), of fewer at the ends; NaN stays NaN."""
+    known = np.isfinite(values)
+    total = np.pad(np.cumsum(np.where(known, values, 0.0), axis=0), ((1, 0), (0, 0)))
+    count = np.pad(np.cumsum(known, axis=0), ((1, 0), (0, 0)))
+    frames = np.arange(len(values))
+    first, last = np.maximum(frames - half, 0), np.minimum(frames + half + 1, len(values))
+    means = (total[last] - total[first]) / np.maximum(count[last] - count[first], 1)
+    return np.where(known, means, np.nan)

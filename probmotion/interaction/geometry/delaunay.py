@@ -8,9 +8,9 @@ implementation is :mod:`probmotion.interaction.geometry.graphs`.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from probmotion.extras import numba
 from probmotion.interaction.geometry.graphs import JOGGLE, joggle_offsets
 from probmotion.validation import check_finite, check_shape
 

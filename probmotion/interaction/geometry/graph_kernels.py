@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from probmotion.extras import numba
 from probmotion.interaction.geometry.delaunay import is_obtuse, max_planar_edges, write_delaunay
 from probmotion.interaction.geometry.graphs import GRAPHS, N_NEIGHBOURS
 

@@ -8,9 +8,9 @@ the best view. The best-aligned candidate of all views is evaluated first, to ma
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from probmotion.extras import numba
 from probmotion.interaction.geometry.graph_kernels import max_edges
 from probmotion.interaction.geometry.nearest_kernels import (
     Prepared,

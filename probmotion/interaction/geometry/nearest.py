@@ -6,9 +6,9 @@ The code is the compiled counterpart of :mod:`probmotion.interaction.geometry.co
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from probmotion.extras import numba
 from probmotion.interaction.geometry.graph_kernels import graphs_of_visible, max_edges, write_graph
 from probmotion.interaction.geometry.graphs import GRAPHS, check_graph, joggle_offsets
 from probmotion.interaction.geometry.likelihood_kernels import (

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from probmotion.extras import numba
 from probmotion.interaction.geometry.graph_kernels import max_edges, write_graph
 from probmotion.interaction.geometry.plane_contexts import context_cost, polar_bins
 

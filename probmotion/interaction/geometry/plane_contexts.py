@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
+from probmotion.extras import numba
 from probmotion.interaction.geometry.shape_context import N_ANGLES, RING_EDGES
 
 __all__ = ["context_cost", "polar_bins"]

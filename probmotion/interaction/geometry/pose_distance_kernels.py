@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
+from probmotion.extras import numba
 from probmotion.interaction.geometry.rigid_kernels import align, residual
 
 __all__ = ["cartesian_minima", "interaction_minima"]

@@ -7,9 +7,9 @@ rotation and give a lower bound (merging bins never increases a χ² cost) for s
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from probmotion.extras import numba
 from probmotion.interaction.geometry.rigid_kernels import align
 from probmotion.interaction.geometry.shape_context import N_BANDS, N_SECTORS, RING_EDGES
 

@@ -60,28 +60,33 @@ class Calibration:
         """Return the index of each recording's camera, by the names of files or folders.
 
         A name matches if it contains the camera's or is contained in it, without punctuation and
-        ``json``. Recordings whose names do not match are in the order of the cameras, if there are
-        as many.
+        ``json``. Recordings none of whose names matches are in the order of the cameras, if there
+        are as many.
 
         Raises
         ------
         ValueError
-            If names do not match and there are more or fewer recordings than cameras.
+            If some names only match, two match one camera, or none matches and there are more or
+            fewer recordings than cameras.
         """
         cameras = [_plain(name) for name in self.names]
-        found = []
+        found: list[int | None] = []
         for name in map(_plain, names):
             fits = [v for v, own in enumerate(cameras) if name and (own in name or name in own)]
-            same = [v for v in fits if cameras[v] == name]
-            fits = same or fits
-            found += fits if len(fits) == 1 else []
-        if len(found) == len(names) == len(set(found)):
-            return found
-        if len(names) == len(self.names):
+            fits = [v for v in fits if cameras[v] == name] or fits
+            found.append(fits[0] if len(fits) == 1 else None)
+        matched = [v for v in found if v is not None]
+        if len(set(matched)) == len(names):
+            return matched
+        if not matched and len(names) == len(self.names):
             return list(range(len(names)))
+        got = ", ".join(
+            f"{name or 'no name'} ({'no camera' if v is None else self.names[v]})"
+            for name, v in zip(names, found, strict=True)
+        )
         raise ValueError(
-            f"keypoints must be named after the calibrated cameras {', '.join(self.names)}, or be "
-            f"as many in their order, got {', '.join(name or 'no name' for name in names)}"
+            f"keypoints must be named after the calibrated cameras {', '.join(self.names)}, or all "
+            f"have other names and be as many in their order, got {got}"
         )
 
 

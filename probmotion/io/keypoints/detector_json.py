@@ -5,7 +5,8 @@ format                 content
 =====================  ==========================================================================
 COCO annotations       ``{"images": […], "annotations": [{"image_id", "keypoints", …}], …}``
 COCO results           ``[{"image_id": "12.jpg", "keypoints": [x, y, confidence, …]}, …]``
-AlphaPose              as COCO results, with the track id in ``"idx"``
+AlphaPose              as COCO results, with the track id in ``"idx"``; of merged detections, a
+                       list of ids, of which the first is used
 AlphaPose "open",      ``{"12.jpg": {"people": [{"pose_keypoints_2d": […]}]}, …}``,
 AlphaPose "cmu"        ``{"12.jpg": {"bodies": [{"joints": […]}]}, …}``
 OpenPose               a folder of files ``{"people": [{"pose_keypoints_2d": […]}]}``, one per
@@ -22,7 +23,8 @@ COCO-WholeBody (133) and Halpe (136), the keypoints of the body are read. OpenPo
 In COCO annotations and OpenPose files, the listed images are the frames. The other formats list
 only images with a detection: the frame is the last number in the image's name, and tracks include
 all frames from the first to the last. Keypoints of confidence 0 are NaN. The visibility v of COCO
-annotations becomes the confidence v/2: 0 not labelled, 0.5 occluded, 1 visible.
+annotations becomes the confidence v/2: 0 not labelled, 0.5 occluded, 1 visible. Confidences of
+AlphaPose, which are up to 6 in its models of COCO, are clipped to 1.
 """
 
 from __future__ import annotations
@@ -57,6 +59,7 @@ __all__ = ["keypoint_file", "read_json"]
 
 _BY_COUNT = {16: "alphapose16", 17: "coco17", 18: "openpose18", 26: "halpe26"}  # presets
 _BODY = {133: 17, 136: 26}  # keypoints of the body in COCO-WholeBody and Halpe
+_HIGHEST = 6.0  # confidence of AlphaPose
 _TWO_LAYOUTS = {25: " ('body25' or 'body25b')"}  # ambiguous keypoint counts
 
 
@@ -70,7 +73,8 @@ def read_json(
     """Read the keypoint track of every person in a JSON file or an OpenPose or MMPose folder.
 
     People are identified by ``track_id``, ``idx`` or ``person_id``; otherwise frames must contain
-    one person, unless ``people`` is given. For the arguments, see
+    one person, unless ``people`` is given. Ids that two people of an image share (AlphaPose without
+    tracking) do not identify people. For the arguments, see
     :func:`~probmotion.io.files.open_keypoints`.
 
     Raises
@@ -111,12 +115,18 @@ def keypoint_file(
         counts, given = [_BODY[counts[0]]], None
     if people is not None:
         check_count("people", people)
-        if all(detection.person is None for detection in detections):
+        if not _identified(detections):
             detections = link_people(detections, people)
     rate = parsed.fps if fps is None else fps
     layout = _layout(detections, given, path)
     tracks = tracks_of(detections, parsed.frames, layout, rate, path)
     return KeypointFile(parsed.format, rate, tracks)
+
+
+def _identified(detections: list[Detection]) -> bool:
+    """Return whether people have ids that are unique in every image."""
+    ids = [(one.video, one.frame, one.person) for one in detections if one.person is not None]
+    return bool(ids) and len(set(ids)) == len(ids)
 
 
 def _parsed(content: Any, path: Path) -> Parsed:
@@ -192,7 +202,12 @@ def _results(content: list[dict[str, Any]], path: Path) -> Parsed:
         where = f"{path}, [{number}]"
         location = frame_number(person.get("image_id"), f"{where}, image_id")
         values = keypoint_values(person["keypoints"], where)
-        track_id = _identity(person, ("track_id", "idx"), where)
+        if values[:, 2].max() <= _HIGHEST:
+            values[:, 2] = values[:, 2].clip(max=1)
+        merged = person.get("idx")
+        while isinstance(merged, list) and merged:
+            merged = merged[0]
+        track_id = _identity(person | {"idx": merged}, ("track_id", "idx"), where)
         detections.append(Detection(*location, track_id, values, where))
     return Parsed("AlphaPose" if _all_have(content, "idx") else "COCO results", detections)
 

@@ -154,9 +154,9 @@ def numbers_of(file: Any, key: str, ndim: int, path: Path) -> np.ndarray:
 
 
 def strings_of(file: Any, key: str, path: Path) -> list[str]:
-    """Return a dataset of strings."""
+    """Return a dataset of strings; empty ones, which may have any type, are an empty list."""
     item = dataset(file, key, path)
-    if item.ndim != 1 or item.dtype.kind not in "SO":
+    if item.ndim != 1 or (item.size and item.dtype.kind not in "SO"):
         raise MotionFileError(
             f"{path}: {key} must be a list of strings, got {shortened(item.dtype)} of shape "
             f"{item.shape}"

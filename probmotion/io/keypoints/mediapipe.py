@@ -2,12 +2,14 @@
 
 Entries of a list of frames have ``pose_landmarks`` (or ``landmarks``, ``poses``): the points
 ``{"x", "y", "visibility"}`` or ``[x, y, z, visibility]`` of one person, or a list of people; null
-if there is none. Tables have a row per frame, with columns such as ``nose_x`` or ``x1``, or a row
-per landmark, with the columns ``landmark_id``, ``x``, ``y`` and ``visibility``. Frames are
-numbered as in :mod:`~probmotion.io.keypoints.frames`.
+if there is none. ``keypoints`` of points that are objects are landmarks too. Tables have a row per
+frame, with columns such as ``nose_x`` or ``x1``, or a row per landmark, with the columns
+``landmark_id``, ``x``, ``y`` and ``visibility``. Frames are numbered as in
+:mod:`~probmotion.io.keypoints.frames`.
 
 Coordinates normalised to the image are scaled to pixels by its size: that of the file's header
-(``width``, ``height``) or the caller's. Landmarks without ``visibility`` have confidence 1.
+(``width``, ``height``) or the caller's. ``vis``, ``v``, ``score``, ``confidence`` and ``conf`` are
+other names of ``visibility``. Landmarks without it have confidence 1.
 """
 
 from __future__ import annotations
@@ -39,12 +41,14 @@ MEDIAPIPE = "MediaPipe Pose"
 """Name of the format."""
 
 _LANDMARKS = ("pose_landmarks", "poseLandmarks", "landmarks", "poses")
+_VISIBILITY = ("visibility", "vis", "v", "score", "confidence", "conf")
 _LANDMARK = ("landmark_id", "landmark_index", "landmark", "landmark_name")  # columns
 _NORMALISED = 2.0  # largest median coordinate relative to the image
 _MISSING = frozenset(("", "nan", "none"))  # cells without a value
 _NAMES = PRESETS["mediapipe33"].joint_names
-_COLUMN = re.compile(r"(?P<part>.*\w)[_ .](?P<axis>x|y|v|visibility)")
-_NUMBERED_COLUMN = re.compile(r"(?P<axis>x|y|v|visibility)_?(?P<part>\d+)")
+_AXIS = rf"(?P<axis>x|y|{'|'.join(_VISIBILITY)})"
+_COLUMN = re.compile(rf"(?P<part>.*\w)[_ .]{_AXIS}")
+_NUMBERED_COLUMN = re.compile(rf"{_AXIS}_?(?P<part>\d+)")
 
 
 def read_landmarks(
@@ -58,7 +62,7 @@ def read_landmarks(
         If the file is damaged, or ``image_size`` is missing.
     """
     header: dict[str, Any] = content if isinstance(content, dict) else {}
-    lists = ("frames", "landmarks")
+    lists = ("frames", *_LANDMARKS)
     entries = next((header[key] for key in lists if _are_frames(header.get(key))), None)
     if entries is None:
         entries = [content] if header else content
@@ -83,7 +87,7 @@ def read_landmark_table(
     for column, name in enumerate(names):
         match = _COLUMN.fullmatch(name) or _NUMBERED_COLUMN.fullmatch(name)
         if match and (part := _landmark(match["part"])) is not None:
-            columns[part, match["axis"][0]] = column
+            columns[part, "v" if match["axis"] in _VISIBILITY else match["axis"]] = column
     first = min((part for part, _ in columns), default=0)  # numbers may start at 1
     columns = {(part - first, axis): column for (part, axis), column in columns.items()}
     complete = all((part, axis) in columns for part in range(len(_NAMES)) for axis in "xy")
@@ -119,7 +123,7 @@ def read_landmark_table(
                 raise MotionFileError(
                     f"{where}: expected one of {len(_NAMES)} landmarks, got {shortened(name)}"
                 )
-            visibility = cells.get("visibility", cells.get("v", "1"))
+            visibility = next((cells[key] for key in _VISIBILITY if key in cells), "1")
             points[part] = _point_of([cells["x"], cells["y"], visibility], where)
     return _landmark_frames(list(entries.values()), {}, path, image_size)
 
@@ -130,13 +134,14 @@ def _are_frames(entries: Any) -> bool:
 
 def _is_frame(entry: Any) -> bool:
     if isinstance(entry, dict):
-        return any(key in entry for key in _LANDMARKS)
-    return (
-        isinstance(entry, list)
-        and len(entry) > 0
-        and isinstance(entry[0], dict)
-        and _is_point(entry[0])
-    )
+        return any(key in entry for key in _LANDMARKS) or _are_objects(entry.get("keypoints"))
+    return _are_objects(entry)
+
+
+def _are_objects(points: Any) -> bool:
+    """Return whether points are objects with coordinates."""
+    first = points[0] if isinstance(points, list) and points else None
+    return isinstance(first, dict) and _is_point(first)
 
 
 def _landmark_frames(
@@ -161,7 +166,7 @@ def _landmarks(entry: Any, where: str) -> Iterator[Person]:
     """Yield the people of a frame of MediaPipe."""
     if not isinstance(entry, dict | list | None):
         raise MotionFileError(f"{where} must be an object, got {shortened(entry)}")
-    value = value_of(entry, _LANDMARKS) if isinstance(entry, dict) else entry
+    value = value_of(entry, (*_LANDMARKS, "keypoints")) if isinstance(entry, dict) else entry
     if not value:
         return
     several = isinstance(value, list) and not _is_point(value[0])
@@ -175,7 +180,7 @@ def _landmarks(entry: Any, where: str) -> Iterator[Person]:
         if len(person) != len(_NAMES):
             raise MotionFileError(f"{at}: expected {len(_NAMES)} landmarks, got {len(person)}")
         rows = [
-            [point["x"], point["y"], point.get("visibility", 1.0)]
+            [point["x"], point["y"], next((point[k] for k in _VISIBILITY if k in point), 1.0)]
             if isinstance(point, dict)
             else [point[0], point[1], point[3] if len(point) > 3 else 1.0]
             for point in person

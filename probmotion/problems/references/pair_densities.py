@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from probmotion.extras import numba
 from probmotion.interaction.geometry.nearest_kernels import (
     INTERACTION,
     Prepared,

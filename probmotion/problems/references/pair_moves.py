@@ -10,8 +10,9 @@ from __future__ import annotations
 from itertools import combinations
 from typing import NamedTuple
 
-import numba
 import numpy as np
+
+from probmotion.extras import numba
 
 __all__ = [
     "HINGE",

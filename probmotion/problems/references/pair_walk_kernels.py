@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from probmotion.extras import numba
 from probmotion.interaction.geometry.graph_kernels import max_edges
 from probmotion.problems.references.pair_densities import (
     Physics,

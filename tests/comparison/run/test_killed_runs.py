@@ -17,7 +17,7 @@ MOMENTS = [
     r"open pilots/generation/\.walking",
     r"os\.rename pilots/generation/\.walking",
     r"os\.rename runs/generation/walking/\.unfinished-1-\d+/\.draws",
-    r"open runs/generation/walking/\.unfinished-1-\d+/run\.json",
+    r"open runs/generation/walking/\.unfinished-1-\d+/\.run",
     r"os\.rename runs/generation/walking/\.unfinished-1-\d+$",
     r"os\.rename \.table",
 ]

@@ -10,7 +10,11 @@ import pytest
 
 from probmotion import KeypointTrack, Skeleton
 from probmotion.data.synthetic.dances import synthetic_dances
-from probmotion.interaction.annotations.tracks import annotations_of_tracks
+from probmotion.interaction.annotations.tracks import (
+    annotations_of_tracks,
+    keypoints_of_tracks,
+    running_median,
+)
 from probmotion.io.keypoints.files import read_keypoints
 
 PAIR = Skeleton.preset("pair17")
@@ -89,6 +93,26 @@ def test_scale_is_estimated_from_limb_lengths(scale):
     knee, ankle = (PAIR.index(f"person0:left_{joint}") for joint in ("knee", "ankle"))
     shin = np.linalg.norm(result.keypoints[:, knee] - result.keypoints[:, ankle], axis=-1).max()
     assert shin == pytest.approx(np.linalg.norm(SEED[knee] - SEED[ankle]), rel=0.1)
+
+
+def test_noise_and_outliers_hardly_change_the_scale():
+    rng = np.random.default_rng(0)
+    noisy = []
+    for track in detections("coco17"):
+        points = track.keypoints + 6.0 * rng.standard_normal(track.keypoints.shape)  # 2 cm
+        wrong = rng.random(points.shape[:2]) < 0.05
+        points[wrong] += 60.0 * rng.standard_normal((int(wrong.sum()), 2))
+        noisy.append(replace(track, keypoints=points))
+    exact, found = (keypoints_of_tracks(each, SEED) for each in (detections("coco17"), noisy))
+    joint = PAIR.index("person0:left_ankle")
+    ratio = np.nanmedian(found[:, joint, 1]) / np.nanmedian(exact[:, joint, 1])
+    assert ratio == pytest.approx(1.0, abs=0.05)
+
+
+def test_running_medians_ignore_gaps_and_single_outliers():
+    values = np.array([0.0, 1.0, 90.0, np.nan, 4.0, 5.0, np.nan, np.nan, np.nan])
+    expected = [0.0, 1.0, 1.0, 4.0, 4.0, 4.0, 5.0, np.nan, np.nan]
+    np.testing.assert_array_equal(running_median(values, 1), expected)
 
 
 def test_frames_with_a_missing_person_are_dropped():

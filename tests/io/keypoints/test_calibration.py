@@ -56,7 +56,6 @@ def test_distortion_is_removed(path):
         (["cam02_json"], [1]),
         (["Cam01.trial", "cam-02"], [0, 1]),
         (["left", "right"], [0, 1]),
-        (["cam_01", "cam_01"], [0, 1]),
     ],
 )
 def test_recordings_are_matched_by_name_or_else_by_order(path, names, found):
@@ -68,9 +67,17 @@ def test_names_that_contain_others_are_matched_exactly(path):
     assert read_calibration(path).matched(["cam010_json", "cam01_json"]) == [1, 0]
 
 
-def test_other_numbers_without_names_are_refused(path):
-    with pytest.raises(ValueError, match=r"cameras cam_01, cam_02, or be as many .* got left$"):
-        read_calibration(path).matched(["left"])
+@pytest.mark.parametrize(
+    ("names", "got"),
+    [
+        (["left"], r"left \(no camera\)"),
+        (["cam_02", "left"], r"cam_02 \(cam_02\), left \(no camera\)"),
+        (["cam_01", "cam01_json"], r"cam_01 \(cam_01\), cam01_json \(cam_01\)"),
+    ],
+)
+def test_names_of_some_cameras_only_are_refused(path, names, got):
+    with pytest.raises(ValueError, match=rf"cameras cam_01, cam_02, or all have .* got {got}$"):
+        read_calibration(path).matched(names)
 
 
 @pytest.mark.parametrize(

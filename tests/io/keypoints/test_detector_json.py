@@ -59,6 +59,33 @@ def test_results_form_one_track_per_track_id(tmp_path):
         assert_track(ten, FIRST, [0, 1, 2, 3])
 
 
+def test_alphapose_without_tracking(tmp_path):
+    """Everybody has the id 0, and merged detections have a list of ids."""
+    content = [result(i, FIRST[i], idx=[[0.0], [0.0]]) for i in range(4)]
+    (track,) = read_keypoints(written(tmp_path, content), fps=25)
+    assert_track(track, FIRST, [0, 1, 2, 3])
+    apart = SECOND + np.array([500, 0, 0])
+    content += [result(i, apart[i], idx=[0.0]) for i in range(4)]
+    path = written(tmp_path, content)
+    with pytest.raises(MotionFileError, match="got person '0' twice in frame 0; set people"):
+        read_keypoints(path, fps=25)
+    left, right = read_keypoints(path, fps=25, people=2)
+    assert_track(left, FIRST, [0, 1, 2, 3])
+    np.testing.assert_array_equal(right.keypoints[0], apart[0, :, :2])
+    tracked = written(tmp_path, [result(0, FIRST[0], idx=k) for k in (1, [[2.0], [3.0]])])
+    assert [each.name for each in read_keypoints(tracked, fps=25, people=1)] == [
+        "tracks 1",
+        "tracks 2",
+    ]
+
+
+def test_confidences_of_alphapose_are_clipped(tmp_path):
+    high = FIRST[0] * [1, 1, 5]
+    (track,) = read_keypoints(written(tmp_path, [result(0, high, idx=0)]), fps=25)
+    np.testing.assert_array_equal(track.confidence[0], np.minimum(high[:, 2], 1))
+    assert (high[:, 2] > 1).any()
+
+
 def test_names_are_sorted_by_their_numbers():
     assert sorted(["f10", "f9", "f", "e11"], key=natural) == ["e11", "f", "f9", "f10"]
 
@@ -236,6 +263,7 @@ def category(**more):
         ([ONE, ONE], "unique track ids .* got two people without track ids in frame 0"),
         ([openpose(FIRST[0], SECOND[0], person_id=[-1])], "two people without track ids"),
         ([ONE, result(0, FIRST[0], idx=1)], "track id for all .* or none, got 1 of 2 without"),
+        ([result(0, FIRST[0], idx=[{}, 1])], "track_id must be int or str, got {}"),
         ([result(0, FIRST[0], idx=1)] * 2, "got person '1' twice in frame 0"),
         ([result(0, FIRST[0], idx={})], "track_id must be int or str, got {}"),
         ([ONE | {"image_id": "a.jpg"}], "a frame number of at most 18 digits, got 'a.jpg'"),

@@ -93,14 +93,12 @@ def test_sleap(tmp_path, order):
 
 
 def test_optional_parts_of_sleap(tmp_path):
-    path = sleap(tmp_path, edge_inds=np.array(EDGES).T, track_names=np.empty(0), point_scores=None)
-    with pytest.raises(MotionFileError, match="track_names must be a list of strings, got"):
-        read_keypoints(path, 30)
-    path = sleap(tmp_path, edge_inds=np.array(EDGES).T, track_names=None, point_scores=None)
-    first, second = read_keypoints(path, 30)
-    assert (first.name, second.name) == ("clip 0", "clip 1")
-    assert first.skeleton.parents == (-1, 0, 1, 1)
-    assert (first.confidence == 1).all()
+    for names in (None, np.empty(0)):  # SLEAP stores an empty list of names as numbers
+        path = sleap(tmp_path, edge_inds=np.array(EDGES).T, track_names=names, point_scores=None)
+        first, second = read_keypoints(path, 30)
+        assert (first.name, second.name) == ("clip 0", "clip 1")
+        assert first.skeleton.parents == (-1, 0, 1, 1)
+        assert (first.confidence == 1).all()
     path = sleap(
         tmp_path, edge_inds=None, tracks=POINTS[:1].transpose(0, 3, 2, 1), point_scores=None
     )
@@ -144,6 +142,8 @@ def test_movement(tmp_path, order, singular):
         ({"point_scores": SCORES}, r"expected point_scores of \(2, 5, 4\) .*, got \(2, 4, 5\)"),
         ({"point_scores": -SCORES.transpose(0, 2, 1)}, "confidence must be 0 to 2, got -0"),
         ({"node_names": np.arange(4)}, "node_names must be a list of strings, got dtype"),
+        ({"track_names": np.arange(2)}, "track_names must be a list of strings, got dtype"),
+        ({"node_names": np.empty(0)}, r"tracks must have shape \(tracks, 2, 0 nodes, frames\)"),
         ({"node_names": np.array([b"a"] * 4)}, "joint_names must be unique"),
         ({"node_names": None}, r"expected a table of DeepLabCut, .* got 'edge_inds \(3, 2\)"),
         ({"edge_inds": np.array([[0, 9]])}, r"edges between keypoints 1 to 4, got \[1.0, 10.0\]"),

@@ -51,6 +51,12 @@ def long(keys):
     return "\n".join(lines) + "\n"
 
 
+def scored(frame):
+    """Return landmarks with other names of the visibility."""
+    key = ("score", "vis", "confidence")[frame]
+    return [{key: p["visibility"], "x": p["x"], "y": p["y"]} for p in landmarks(frame)]
+
+
 FRAMES = [{"pose_landmarks": landmarks(k)} for k in range(3)]
 JSONS = {
     "frames": FRAMES,
@@ -58,6 +64,8 @@ JSONS = {
     "wrapped": {"metadata": {"name": "a"}, "frames": FRAMES},
     "arrays": {"landmarks": [{"frame": k, "poseLandmarks": rows(k)} for k in range(3)]},
     "bare": [landmarks(k) for k in range(3)],
+    "poses of all frames": {"frameRate": 25, "poses": [landmarks(k) for k in range(3)]},
+    "keypoints": [{"frame_id": k, "keypoints": scored(k)} for k in range(3)],
     "protocol buffers": [{"pose_landmarks": {"landmark": landmarks(k)}} for k in range(3)],
     "names": [
         {"landmarks": {n.upper(): p for n, p in zip(NAMES, landmarks(k), strict=True)}}
@@ -68,7 +76,9 @@ TABLES = {
     "names": wide(lambda k, axis: f"{NAMES[k].upper()}_{axis}", "frame"),
     "from 1": wide(lambda k, axis: f"{axis[0]}{k + 1}", "class"),
     "from 0": wide(lambda k, axis: f"landmark_{k}_{axis}"),
+    "short names": wide(lambda k, axis: f"lm_{k}_{axis[:3]}", "label"),
     "long": long(range(33)),
+    "long, scores": long(range(33)).replace("visibility", "score"),
     "long names": long(NAMES),
 }
 

@@ -1,0 +1,133 @@
+"""Page of lifted pairs: the motion, the keypoints beside it, and a command to start from a frame.
+
+It is self-contained.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+
+from probmotion.comparison.results.stored_problems import StoredProblem
+from probmotion.geometry.cameras import Cameras
+from probmotion.motion.motion import Motion
+from probmotion.plots.animation import (
+    CONTENT_POLICY,
+    animation_html,
+    animation_script,
+    animation_style,
+)
+from probmotion.plots.motion_data import Shown
+
+__all__ = ["pair_page"]
+
+_DRAWS = 24  # draws from which the page computes standard deviations
+_FRAMES = 900  # most frames of the animation
+_STYLE = """
+body { margin: 0 auto; max-width: 75rem; padding: 1rem; }
+h1 { font-size: 1.4rem; } h2 { font-size: 1.1rem; margin: .8rem 0 .3rem; }
+.sides { display: grid; gap: 1rem; grid-template-columns: repeat(auto-fit, minmax(20rem, 1fr)); }
+.picture canvas { display: block; width: 100%; aspect-ratio: 4 / 3; border: 1px solid var(--rule); }
+.picture pre { overflow-x: auto; background: var(--raised); padding: .5rem; font-size: .85rem; }
+"""
+_START = """\
+import probmotion as pm
+from probmotion.interaction.annotations import Annotations
+from probmotion.models.pose_pairs.pair_posterior import pair_posterior
+
+pair = pm.load({motion!r}).positions[FRAME]
+annotations = Annotations.load({annotations!r})
+draws = pm.sample(pair_posterior(pair, annotations), "mh")"""
+_REFUSED = "# Frame FRAME has too many joint angles beyond the limits: choose another one."
+
+
+def pair_page(
+    motion: Motion,
+    draws: np.ndarray,
+    keypoints: np.ndarray,
+    seeds: np.ndarray,
+    sentences: Sequence[str],
+    folder: Path,
+) -> str:
+    """Return the page as HTML.
+
+    Parameters
+    ----------
+    motion : Motion
+        Posterior mean on ``pair17``, in the axes of the camera.
+    draws : ndarray, (n, L, J, 3)
+        Posterior draws, metres.
+    keypoints : ndarray, (L, J, 2)
+        Keypoints in the same axes, metres; NaN where missing.
+    seeds : ndarray of bool, (L,)
+        Frames from which sampling can start.
+    sentences : sequence of str
+        Summary.
+    folder : Path
+        Folder of ``pairs.npz`` and ``annotations.npz`` in the command.
+    """
+    name = motion.name or "pairs"
+    step = max(1, -(-motion.frames // _FRAMES))
+    camera = Cameras(
+        np.diag([1.0, -1.0, -1.0])[None], np.zeros((1, 3)), np.ones(1), np.zeros((1, 2))
+    )
+    problem = StoredProblem(
+        motion.skeleton, motion.fps, True, camera=camera, keypoints=keypoints * [1.0, -1.0]
+    )
+    rows = {"lift": np.concatenate([motion.positions[None], draws[:_DRAWS]])}
+    captions = {"lift": "mean and three draws; joints coloured by their standard deviation"}
+    animation = animation_html(name, Shown(problem, rows, step, overlaid=True), captions)
+    paths = {
+        "motion": (folder / "pairs.npz").as_posix(),
+        "annotations": (folder / "annotations.npz").as_posix(),
+    }
+    numbers = {
+        "step": step,
+        "commands": {"start": _START.format(**paths), "refused": _REFUSED},
+        "seeds": seeds.astype(int).tolist(),
+    }
+    # Escape "<", so that no text can end the script element.
+    content = json.dumps(numbers, separators=(",", ":")).replace("<", r"\u003c")
+    summary = "".join(f"<p>{escape(sentence)}</p>" for sentence in sentences)
+    title = escape(f"{name}: two people lifted from one camera")
+    return f"""\
+<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+{CONTENT_POLICY}
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{title}</title>
+<style>{animation_style()}{_STYLE}</style>
+</head>
+<body>
+<h1>{title}</h1>
+{summary}
+<div class="sides">
+{animation}
+<div class="picture">
+<h2>Keypoints</h2>
+<canvas role="img" aria-label="Keypoints of the frame">This picture requires JavaScript.</canvas>
+<h2>Sample pose-pairs around this frame</h2>
+<pre><code></code></pre>
+<button type="button" data-does="copy">Copy</button>
+<script type="application/json">{content}</script>
+</div>
+</div>
+<script>
+document.querySelectorAll(".animation").forEach({animation_script()});
+document.querySelectorAll(".picture").forEach({_text("probmotion.plots", "picture.js")});
+document.querySelectorAll("[data-does=copy]").forEach({_text("probmotion.report", "copy.js")});
+</script>
+</body>
+</html>
+"""
+
+
+def _text(package: str, name: str) -> str:
+    return files(package).joinpath(name).read_text(encoding="utf-8")
