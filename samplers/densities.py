@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from probmotion import seeds
-from probmotion.posteriors.draws import MotionDraws, settings_of
+from probmotion.posteriors.draws import MotionDraws, check_same_run
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.protocols import HasSeeds, NotConjugate
 from probmotion.posteriors.sampling import Sampler, UnsupportedPosterior, batches, require
 from probmotion.seeds import NormalStreams
 from probmotion.validation import check_count, check_finite, check_shape
 
-__all__ = ["Density", "check_same_run", "continued", "motions", "not_conjugate", "starting_points"]
+__all__ = ["Density", "continued", "motions", "not_conjugate", "starting_points"]
 
 
 class Density:
@@ -163,23 +162,6 @@ def continued(
             f"{stored[0]:.6g} instead of {recomputed[0]:.6g}"
         )
     return initial.state
-
-
-def check_same_run(sampler: Sampler, initial: MotionDraws, chains: int, seed: int) -> None:
-    """Raise ``ValueError`` unless ``initial`` has this sampler, seed and number of chains."""
-    attributes = initial.dataset.attrs
-    settings = settings_of(sampler)
-    for name, value, earlier in (
-        ("sampler", sampler.name, attributes["sampler"]),
-        ("settings", settings, json.loads(attributes["settings"])),
-        ("seed", seed, int(attributes["seed"])),
-        ("chains", chains, initial.dataset.sizes["chain"]),
-    ):
-        if value != earlier:
-            raise ValueError(
-                f"{name} must be {earlier}, as in the run to be continued, got {value}; start a "
-                "new run to change it"
-            )
 
 
 def motions(posterior: MotionPosterior, theta: np.ndarray, seed: int, first: int) -> np.ndarray:

@@ -12,10 +12,9 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from probmotion.arrays import to_numpy
-from probmotion.posteriors.draws import MotionDraws
+from probmotion.posteriors.draws import MotionDraws, check_same_run
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.sampling import Interrupted, batches, progress_bar, require
-from probmotion.samplers.densities import check_same_run
 from probmotion.seeds import NormalStreams
 from probmotion.threads import one_thread
 from probmotion.validation import check_count

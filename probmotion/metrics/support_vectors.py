@@ -55,7 +55,8 @@ def _folds(labels: np.ndarray, n_folds: int, rng: np.random.RandomState) -> np.n
 
 def _predicted(points: np.ndarray, labels: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Return the labels of other points, (m,), by a machine trained on labelled points."""
-    inverse_scale = 1 / (points.shape[1] * points.var())
+    variance = points.var()
+    inverse_scale = 1 / (points.shape[1] * variance) if variance > 0 else 1.0
     signs = np.where(labels == 0, 1.0, -1.0)
     kernel = _kernel(points, points, inverse_scale).astype(np.float32).astype(np.float64)
     alpha, offset = _solved(kernel, signs)
@@ -67,7 +68,8 @@ def _kernel(x: np.ndarray, y: np.ndarray, inverse_scale: float) -> np.ndarray:
     """Return exp(−‖x − y‖² γ), ``(n, D), (m, D) → (n, m)``."""
     squares = [np.einsum("nd,nd->n", points, points) for points in (x, y)]
     distances = squares[0][:, None] + squares[1] - 2 * (x @ y.T)
-    return np.exp(-inverse_scale * distances)
+    # Rounding can make distances of close points negative, which large factors would amplify.
+    return np.exp(-inverse_scale * np.maximum(distances, 0))
 
 
 def _solved(kernel: np.ndarray, signs: np.ndarray) -> tuple[np.ndarray, float]:

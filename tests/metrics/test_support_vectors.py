@@ -20,6 +20,15 @@ def test_accuracies_are_those_of_scikit_learn(n, shift, rng):
         assert cross_validated_accuracy(features, labels, 5, seed) == expected
 
 
+@pytest.mark.parametrize("outlier", [1e8, 1e12])
+def test_accuracy_with_a_diverged_point_is_that_of_scikit_learn(outlier, rng):
+    features, labels = rng.normal(size=(200, 6)), np.repeat([0, 1], 100)
+    features[0] *= outlier
+    folds = StratifiedKFold(5, shuffle=True, random_state=0)
+    expected = cross_val_score(SVC(), features, labels, cv=folds).mean()
+    assert cross_validated_accuracy(features, labels, 5, 0) == pytest.approx(expected, abs=0.03)
+
+
 def test_ties_are_resolved_as_by_scikit_learn():
     # At the start, all points are equally steep.
     labels = np.repeat([0, 1], 60)

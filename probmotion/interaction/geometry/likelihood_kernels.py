@@ -24,8 +24,8 @@ from probmotion.interaction.geometry.nearest_kernels import (
 __all__ = ["log_terms_in_batch", "log_terms_on_threads"]
 
 _NEGLIGIBLE = 42.0
-"""Nats below the best view at which a view is left out: 32 of them do not change the mean in
-double precision."""
+"""Nats below the best of 32 views at which a view is left out: the others together do not change
+the mean in double precision."""
 
 
 @numba.njit(cache=True)
@@ -74,7 +74,7 @@ def _write_log_terms(
             left = (prepared.square[k] - 2.0 * product) / max(prepared.n_visible[k], 1)
             alignment[view] = min(alignment[view], left)
     logs[:] = -np.inf
-    limit = np.inf
+    limit, negligible = np.inf, _NEGLIGIBLE + np.log(max(1.0, n_views / 32))
     difference, bounds = np.empty((2, n_joints)), np.empty(n_candidates)
     terms = np.empty(max_edges(n_joints, prepared.graph))
     for view in np.argsort(alignment):
@@ -101,7 +101,7 @@ def _write_log_terms(
             if distance <= best:
                 best = distance
                 logs[view] = -0.5 * (distance / noise) ** 2
-        limit = min(limit, np.sqrt(best**2 + 2.0 * _NEGLIGIBLE * noise**2))
+        limit = min(limit, np.sqrt(best**2 + 2.0 * negligible * noise**2))
 
 
 @numba.njit(cache=True)
