@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 TUTORIALS := $(wildcard notebooks/[0-9]*.py)
 
-.PHONY: install demo test slow fuzz lint types notebooks docs bench clean
+.PHONY: install demo test slow fuzz faults lint types notebooks docs bench clean
 
 install: $(VENV)/.installed
 
@@ -33,6 +33,11 @@ slow: install
 fuzz: install
 	PROBMOTION_FUZZ=1000000 OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 \
 		$(BIN)/python -m pytest -n 2 --dist worksteal tests/fuzz
+
+# Kills at 100 random moments of each program, Ctrl-C at 50; "make test" tries two. Full disks need root.
+faults: install
+	PROBMOTION_FAULTS=100 OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 \
+		$(BIN)/python -m pytest -n 2 --dist worksteal tests/faults
 
 lint: install
 	$(BIN)/ruff check .

@@ -1,4 +1,4 @@
-"""Atomic file writes, checks of output folders, and safe reading of archives and JSON."""
+"""Atomic file writes, locks and checksums, and safe reading of archives and JSON."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import sys
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,14 +20,29 @@ if TYPE_CHECKING:
     import numpy as np
 
 __all__ = [
+    "LOCK",
+    "UNSEALED",
     "forget_killed",
+    "locked_folder",
     "member_array",
     "open_archive",
     "read_arrays",
     "read_json",
+    "sealed",
     "writable_folder",
+    "write_errors",
+    "write_json",
+    "write_seal",
     "written_whole",
 ]
+
+LOCK = ".lock"
+"""File of :func:`locked_folder`."""
+
+UNSEALED = "crc32 --------"
+"""Text that :func:`write_seal` replaces by a checksum of the same length."""
+
+_CHECKSUM, _CHUNK = "crc32", 2**20
 
 # An archive may unpack to this number of bytes, or to this multiple of its own size. Recorded
 # numbers compress to a tenth at most, zeros to a thousandth.
@@ -62,15 +77,23 @@ def written_whole(path: Path) -> Iterator[Path]:
     owner = f"{_MACHINE}.{os.getpid()}"
     unfinished = path.with_name(f".{path.stem}.{owner}.unfinished{path.suffix}")
     try:
-        yield unfinished
-        os.replace(unfinished, path)
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise OSError(f"cannot write {path}: {reason}; choose a writable folder") from error
+        with write_errors(path):
+            yield unfinished
+            os.replace(unfinished, path)
     finally:
         # If the folder is missing, unlink fails too and must not mask the original error.
         with suppress(OSError):
             unfinished.unlink()
+
+
+@contextmanager
+def write_errors(path: Path) -> Iterator[None]:
+    """Raise errors of the operating system in the block as ``OSError`` that names ``path``."""
+    try:
+        yield
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise OSError(f"cannot write {path}: {reason}; choose a writable folder") from error
 
 
 def forget_killed(folder: Path) -> None:
@@ -98,16 +121,43 @@ def _is_running(process: int) -> bool:
     return True
 
 
-def writable_folder(folder: Path) -> Path:
-    """Return ``folder``, created if needed; raise ``OSError`` if it is not writable."""
+def writable_folder(folder: Path, name: str = "out") -> Path:
+    """Return ``folder``, created if needed; raise ``OSError`` if it is not writable.
+
+    It is the argument ``name`` of a function.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
         reason = error.strerror or str(error)
-        raise OSError(f"out must be a writable folder, got {str(folder)!r}: {reason}") from error
+        raise OSError(f"{name} must be a writable folder, got {str(folder)!r}: {reason}") from error
     return folder
+
+
+@contextmanager
+def locked_folder(name: str, folder: Path) -> Iterator[None]:
+    """Lock a folder while the block runs; the argument ``name`` of a function is the folder.
+
+    The operating system releases the lock when the process ends, even if it is killed.
+
+    Raises
+    ------
+    ValueError
+        If another process has locked it.
+    """
+    from filelock import FileLock, Timeout
+
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(FileLock(folder / LOCK, blocking=False))
+        except Timeout as error:
+            raise ValueError(
+                f"{name} must not be in use, got {str(folder)!r}, to which another process writes; "
+                "wait for it to end or use another folder"
+            ) from error
+        yield
 
 
 def open_archive(content: bytes) -> zipfile.ZipFile:
@@ -182,17 +232,56 @@ def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
         return {key: member_array(archive, key) for key in (n.removesuffix(".npy") for n in names)}
 
 
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write JSON atomically, with a checksum in the entry ``crc32``."""
+    stored = json.loads(json.dumps(content))  # keys are strings, as when it is read
+    text = json.dumps({**stored, _CHECKSUM: _checksum(stored)}, indent=1)
+    with written_whole(path) as unfinished:
+        unfinished.write_text(text + "\n", encoding="utf-8")
+
+
 def read_json(path: str | Path) -> Any:
-    """Return the content of a JSON file.
+    """Return the content of a JSON file, without the checksum of :func:`write_json`.
 
     Raises
     ------
     ValueError
-        If the file is not JSON in UTF-8.
+        If the file is not JSON in UTF-8, or its checksum does not match.
     OSError
         If the file cannot be opened.
     """
     try:
-        return json.loads(Path(path).read_bytes())
+        content = json.loads(Path(path).read_bytes())
     except RecursionError as error:
         raise ValueError("expected JSON that is not nested deeply") from error
+    if isinstance(content, dict) and _CHECKSUM in content:
+        stored = content.pop(_CHECKSUM)
+        if stored != _checksum(content):
+            raise ValueError(f"expected the checksum {stored!r:.20}, got {_checksum(content)}")
+    return content
+
+
+def _checksum(content: dict[str, Any]) -> str:
+    return f"{zlib.crc32(json.dumps(content, sort_keys=True).encode()):08x}"
+
+
+def sealed(path: Path, seal: str) -> str:
+    """Return the checksum of a file that contains ``seal`` in its first mebibyte.
+
+    The checksum is that of the file with :data:`UNSEALED` in this place, so that a file can contain
+    its own.
+    """
+    with open(path, "rb") as file:
+        value = zlib.crc32(file.read(_CHUNK).replace(seal.encode(), UNSEALED.encode(), 1))
+        while chunk := file.read(_CHUNK):
+            value = zlib.crc32(chunk, value)
+    return f"crc32 {value:08x}"
+
+
+def write_seal(path: Path) -> None:
+    """Replace :data:`UNSEALED` in a file by the checksum."""
+    seal = sealed(path, UNSEALED)
+    with open(path, "r+b") as file:
+        place = file.read(_CHUNK).index(UNSEALED.encode())
+        file.seek(place)
+        file.write(seal.encode())

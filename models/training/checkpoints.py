@@ -14,11 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
-from torch import nn
 
+from probmotion.extras import nn, torch
 from probmotion.files import written_whole
 
 __all__ = [
@@ -83,6 +81,8 @@ def save_checkpoint(path: str | Path, checkpoint: Checkpoint, *, half: bool = Fa
         "settings": settings,
         "sha256": _digest(settings, tensors),
     }
+    from safetensors.torch import save
+
     with written_whole(Path(path)) as unfinished:
         unfinished.write_bytes(save(tensors, metadata={_ENTRY: json.dumps(header)}))
 

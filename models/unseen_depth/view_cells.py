@@ -19,6 +19,7 @@ from probmotion.interaction.annotations.sources import world_axes
 __all__ = [
     "CellEvidence",
     "CellPosterior",
+    "OneDirectionError",
     "ViewCells",
     "check_view_directions",
     "elevation_levels",
@@ -33,6 +34,10 @@ _ROWS = 128  # images evaluated at a time
 _ELEVATION_STEP = np.radians(10.0)  # largest distance of the grid's elevations
 _ONE_AZIMUTH = 0.85  # concentration of azimuths within about 13 degrees of one axis (one sd)
 _LEAST_WEIGHT = 1e-3  # cells of less posterior probability than this are left out
+
+
+class OneDirectionError(ValueError):
+    """All views share one horizontal direction, so that the depth is not identifiable."""
 
 
 class CellEvidence(NamedTuple):
@@ -244,9 +249,9 @@ def elevation_levels(elevations: tuple[float, float]) -> np.ndarray:
 
 
 def check_view_directions(name: str, azimuth_concentration: float) -> None:
-    """Raise ``ValueError`` if all views share one horizontal direction."""
+    """Raise :class:`OneDirectionError` if all views share one horizontal direction."""
     if azimuth_concentration > _ONE_AZIMUTH:
-        raise ValueError(
+        raise OneDirectionError(
             f"{name} must show the poses from several directions, got one view direction only: "
             f"the depth is not identifiable; add {name} from other sides"
         )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 
 from probmotion.calibration.error_measures import MEASURES
 from probmotion.comparison.results.fingerprint import fingerprint
-from probmotion.files import read_json, written_whole
+from probmotion.files import read_json, write_json, written_whole
 from probmotion.metrics.intervals import t_interval
 from probmotion.validation import check_types
 
@@ -164,9 +163,7 @@ class StoredValues:
         self._values[f"{name} {seed}"] = values
         if self.path is None:
             return
-        text = json.dumps({"question": self.question, "values": self._values}, indent=1)
-        with written_whole(self.path) as unfinished:
-            unfinished.write_text(text, encoding="utf-8")
+        write_json(self.path, {"question": self.question, "values": self._values})
 
 
 def _with_interval(row: Any) -> str:

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import FlagCreatePairsOff, Positional
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+if TYPE_CHECKING:
+    from probmotion.motion.motion import KeypointTrack
 
 __all__ = ["Pairs"]
 
@@ -39,6 +43,14 @@ class Pairs:
     people: int | None = None
     """Number of people to track, in files without track ids."""
 
+    persons: Annotated[tuple[int, int] | None, arg(metavar="I J", help_behavior_hint="")] = None
+    """Indices of the two people, in files of more."""
+
+    image_size: Annotated[
+        tuple[float, float] | None, arg(metavar="WIDTH HEIGHT", help_behavior_hint="")
+    ] = None
+    """Size of the video in pixels, for normalised landmarks of MediaPipe."""
+
     swap_people: FlagCreatePairsOff[bool] = False
     """The first person of the keypoints is the second one of the seed."""
 
@@ -49,14 +61,13 @@ class Pairs:
         from probmotion.data.pairs import pair_motion
         from probmotion.files import writable_folder
         from probmotion.io.files import load
-        from probmotion.io.keypoints.files import read_keypoints
         from probmotion.lifting.pairs import lift_pairs
 
         if len(self.seed) not in (1, 2):
             raise ValueError(f"--seed must be one or two files, got {len(self.seed)}")
         motions = [load(path) for path in self.seed]
         start = motions[0] if len(motions) == 1 else pair_motion(motions[0], motions[1])
-        tracks = read_keypoints(self.keypoints, self.fps, self.skeleton, self.people)
+        tracks = self._tracks()
         writable_folder(self.out)
         result = lift_pairs(tracks, start, swap_people=self.swap_people, draws=self.draws)
         result.save(self.out)
@@ -65,3 +76,19 @@ class Pairs:
             f"wrote {self.out / 'pairs.html'}, pairs.bvh, pairs.glb, pairs.npz, annotations.npz, "
             "prior.npz"
         )
+
+    def _tracks(self) -> list[KeypointTrack]:
+        """Return the tracks of the people chosen."""
+        from probmotion.io.keypoints.files import read_keypoints
+
+        tracks = read_keypoints(
+            self.keypoints, self.fps, self.skeleton, self.people, self.image_size
+        )
+        if self.persons is None:
+            return tracks
+        if len(set(self.persons)) != 2 or not set(self.persons) <= set(range(len(tracks))):
+            raise ValueError(
+                f"persons must be two indices of 0 to {len(tracks) - 1}, got "
+                f"{self.persons[0]} and {self.persons[1]}"
+            )
+        return [tracks[person] for person in self.persons]

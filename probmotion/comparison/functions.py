@@ -181,8 +181,8 @@ def _check_draws(motions: np.ndarray, chosen: Problem) -> None:
 
 def _thinned(draws: MotionDraws) -> MotionDraws:
     """Return at most 20 000 evenly spaced draws; the others are not read."""
-    n = draws.dataset.sizes["chain"] * draws.dataset.sizes["draw"]
-    step = -(-n // _MAX_SCORED)
+    most = max(1, _MAX_SCORED // draws.dataset.sizes["chain"])
+    step = max(1, -(-draws.dataset.sizes["draw"] // most))
     return replace(draws, dataset=draws.dataset.isel(draw=slice(None, None, step)))
 
 

@@ -26,7 +26,7 @@ from probmotion.plots.motion_data import Shown
 
 __all__ = ["pair_page"]
 
-_DRAWS = 24  # draws from which the page computes standard deviations
+_DRAWS = 3  # shown beside the mean
 _FRAMES = 900  # most frames of the animation
 _STYLE = """
 body { margin: 0 auto; max-width: 75rem; padding: 1rem; }
@@ -48,6 +48,7 @@ _REFUSED = "# Frame FRAME has too many joint angles beyond the limits: choose an
 
 def pair_page(
     motion: Motion,
+    sd: np.ndarray,
     draws: np.ndarray,
     keypoints: np.ndarray,
     seeds: np.ndarray,
@@ -60,6 +61,8 @@ def pair_page(
     ----------
     motion : Motion
         Posterior mean on ``pair17``, in the axes of the camera.
+    sd : ndarray, (L, J, 3)
+        Posterior standard deviations, metres.
     draws : ndarray, (n, L, J, 3)
         Posterior draws, metres.
     keypoints : ndarray, (L, J, 2)
@@ -81,14 +84,21 @@ def pair_page(
     )
     rows = {"lift": np.concatenate([motion.positions[None], draws[:_DRAWS]])}
     captions = {"lift": "mean and three draws; joints coloured by their standard deviation"}
-    animation = animation_html(name, Shown(problem, rows, step, overlaid=True), captions)
+    shown = Shown(problem, rows, step, overlaid=True, sds={"lift": sd})
+    animation = animation_html(name, shown, captions)
+    folder = folder.resolve()
     paths = {
         "motion": (folder / "pairs.npz").as_posix(),
         "annotations": (folder / "annotations.npz").as_posix(),
     }
+    # Split before paths are inserted, which may contain FRAME: the page joins parts by the number.
+    commands = {
+        "start": [part.format(**paths) for part in _START.split("FRAME")],
+        "refused": _REFUSED.split("FRAME"),
+    }
     numbers = {
         "step": step,
-        "commands": {"start": _START.format(**paths), "refused": _REFUSED},
+        "commands": commands,
         "seeds": seeds.astype(int).tolist(),
     }
     # Escape "<", so that no text can end the script element.

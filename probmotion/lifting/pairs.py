@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from probmotion.models.pose_pairs.joint_limits import JointLimits
 from probmotion.models.pose_pairs.pair_posterior import PairSettings
 from probmotion.models.unseen_depth.annotation_prior import AnnotationPrior
 from probmotion.models.unseen_depth.smoothing import smoothed_lifts
+from probmotion.models.unseen_depth.view_cells import OneDirectionError
 from probmotion.motion.inverse_kinematics import rigid_motion
 from probmotion.motion.motion import KeypointTrack, Motion
 from probmotion.motion.skeleton import Skeleton
@@ -35,6 +37,7 @@ __all__ = ["LiftedPairs", "lift_pairs"]
 _PAIR = Skeleton.preset("pair17")
 _APART = 0.2  # between annotations from which the prior is learnt, seconds
 _LEAST_SECONDS = 10.0  # of frames that show both people
+_CONFIDENT = 0.3  # least confidence of a keypoint that is used
 _NEIGHBOURS = 0.08  # half the length of the medians that tell outliers, seconds
 _FAR = 0.15  # distance of an outlier from the median, metres
 _LONGEST_GAP = 0.2  # of missing keypoints that are interpolated, seconds
@@ -63,7 +66,7 @@ class LiftedPairs:
     annotations : Annotations
         Annotations of the frames that show both people.
     prior : AnnotationPrior
-        Prior learnt from them.
+        Prior learnt from five of them a second.
     other_order : float
         Mean log density of an annotation with the people exchanged, relative to the order used,
         nats; −inf if the prior cannot be learnt in that order.
@@ -89,8 +92,10 @@ class LiftedPairs:
         """Return sentences on the annotations, the precision and the order of the people."""
         depth = 1000 * np.median(self.sd[..., 2])
         image = 1000 * np.median(self.sd[..., :2])
+        learnt = len(_learnt_from(self.annotations, self.mean.fps))
         sentences = [
-            f"The prior is learnt from this video alone: {self.annotations.describe()}; "
+            f"The prior is learnt from this video alone, from {learnt} of its {self.mean.frames} "
+            f"frames. Frames with both people: {self.annotations.describe()}; "
             f"{100 * self.outliers:.1f} % of the keypoints were outliers and left out.",
             f"Joints have a standard deviation of {depth:.0f} mm in depth and {image:.0f} mm along "
             "the image's axes (median).",
@@ -110,13 +115,13 @@ class LiftedPairs:
         """
         folder = Path(folder)
         writable_folder(folder)
-        self.report(folder / "pairs.html")
-        rigid = rigid_motion(self.mean)
-        save(rigid, folder / "pairs.bvh")
-        save(rigid, folder / "pairs.glb")
         write_npz(self.mean, folder / "pairs.npz", {"sd": self.sd, "draws": self.draws})
         self.annotations.save(folder / "annotations.npz")
         self.prior.save(folder / "prior.npz")
+        rigid = rigid_motion(self.mean)
+        save(rigid, folder / "pairs.bvh")
+        save(rigid, folder / "pairs.glb")
+        self.report(folder / "pairs.html")  # last: its command reads the others
 
     def report(self, path: str | Path) -> Path:
         """Write a page to browse the pairs beside the keypoints, and return its path."""
@@ -124,7 +129,13 @@ class LiftedPairs:
         if path.suffix.lower() != ".html":
             raise ValueError(f"path must end in .html, got {str(path)!r}")
         page = pair_page(
-            self.mean, self.draws, self.keypoints, self.valid_seeds, self.summary(), path.parent
+            self.mean,
+            self.sd,
+            self.draws,
+            self.keypoints,
+            self.valid_seeds,
+            self.summary(),
+            path.parent,
         )
         with written_whole(path) as unfinished:
             unfinished.write_text(page, encoding="utf-8")
@@ -150,7 +161,7 @@ def lift_pairs(
     Parameters
     ----------
     tracks : sequence of KeypointTrack
-        Keypoints of both people, pixels.
+        Keypoints of both people, pixels; those with a confidence below .3 are not used.
     start : Motion
         3D pose-pair of the same kind of motion, or several, of which the medoid is used: it sets
         the size of the people and resolves the reflection in depth.
@@ -173,33 +184,44 @@ def lift_pairs(
     check_count("draws", draws, least=2)
     check_count("seed", seed, least=0)
     if len(tracks) != 2:
-        raise ValueError(f"tracks must be of two people, got {len(tracks)}; leave others out")
+        raise ValueError(
+            f"tracks must be of two people, got {len(tracks)}; of more, choose two (--persons I J)"
+        )
     poses = pair_of(start).positions
     pose = poses[choose_seed(poses)]
     ordered = list(tracks)[::-1] if swap_people else list(tracks)
-    fps = tracks[0].fps
-    keypoints, outliers = _repaired(keypoints_of_tracks(ordered, pose), fps)
-    annotations = annotations_of_keypoints(keypoints, fps, tracks[0].name)
+    fps, name = tracks[0].fps, _shared_name(*tracks)
+    keypoints, outliers = _repaired(
+        keypoints_of_tracks(ordered, pose, least_confidence=_CONFIDENT), fps
+    )
+    annotations = annotations_of_keypoints(keypoints, fps, name)
     if len(annotations) < _LEAST_SECONDS * fps:
         raise ValueError(
-            f"tracks must show both people for at least {_LEAST_SECONDS:g} s, got "
-            f"{len(annotations) / fps:.1f} s: the prior is learnt from the video's own frames; use "
-            "a longer video"
+            f"tracks must show both people for at least {_LEAST_SECONDS:g} s with a confidence of "
+            f"at least {_CONFIDENT:g}, got {len(annotations) / fps:.1f} s: the prior "
+            "is learnt from the video's own frames; use a longer video"
         )
-    chosen = annotations.subset(np.arange(0, len(annotations), max(1, round(_APART * fps))))
+    chosen = annotations.subset(_learnt_from(annotations, fps))
     unseen = np.flatnonzero(~chosen.visible.any(axis=0))
     if len(unseen):
         raise ValueError(
-            "tracks must show every joint in some frames, got none of "
-            f"{_PAIR.joint_names[unseen[0]]}"
+            "tracks must show every joint in some frames with a confidence of at least "
+            f"{_CONFIDENT:g}, got none of {_PAIR.joint_names[unseen[0]]}"
         )
-    prior = AnnotationPrior.fit(chosen, pose, progress=progress)
+    try:
+        prior = AnnotationPrior.fit(chosen, pose, progress=progress)
+    except OneDirectionError as error:
+        raise ValueError(
+            "tracks must show the people from several directions, got one direction only: the "
+            "depth is not identifiable; use a longer video in which they turn, or exchange them "
+            "if the first track is the second person of the seed (--swap-people)"
+        ) from error
     rng = seeds.generator(seed, "pairs")
     lifts = smoothed_lifts(prior, keypoints, fps, rng, draws)
     middle, floor = lifts.positions[..., 0].mean(), np.quantile(lifts.positions.min(1)[:, 1], 0.02)
     origin = np.array([middle, floor, 0.0])
     return LiftedPairs(
-        Motion(lifts.positions - origin, _PAIR, fps, name=tracks[0].name),
+        Motion(lifts.positions - origin, _PAIR, fps, name=name),
         lifts.sd,
         lifts.draws - origin,
         keypoints - origin[:2],
@@ -210,9 +232,20 @@ def lift_pairs(
     )
 
 
+def _shared_name(first: KeypointTrack, second: KeypointTrack) -> str:
+    """Return the words with which both names begin: those of the video, without the person."""
+    names = zip(first.name.split(" "), second.name.split(" "), strict=False)
+    return " ".join(word for word, _ in takewhile(lambda pair: pair[0] == pair[1], names))
+
+
+def _learnt_from(annotations: Annotations, fps: float) -> np.ndarray:
+    """Return the indices of the annotations from which the prior is learnt."""
+    return np.arange(0, len(annotations), max(1, round(_APART * fps)))
+
+
 def _repaired(keypoints: np.ndarray, fps: float) -> tuple[np.ndarray, float]:
     """Return keypoints without outliers and short gaps, and the share of outliers."""
-    median = running_median(keypoints, round(_NEIGHBOURS * fps))
+    median = running_median(keypoints, max(1, round(_NEIGHBOURS * fps)))
     far = np.linalg.norm(keypoints - median, axis=-1) > _FAR
     known = np.isfinite(keypoints).all(axis=-1)
     repaired = np.where((known & ~far)[..., None], keypoints, np.nan)
@@ -242,6 +275,6 @@ def _other_order(annotations: Annotations, pose: np.ndarray) -> float:
     )
     try:
         prior = AnnotationPrior.fit(exchanged, pose)
-    except ValueError:  # one view direction only in this order
+    except OneDirectionError:  # in this order only
         return -np.inf
     return float(prior.log_evidence(exchanged).mean())

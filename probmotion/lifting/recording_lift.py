@@ -262,8 +262,8 @@ def _in_calibration(
 
 def _placed(view: CalibratedView, fps: float, guess: float, settings: _Settings) -> LiftedViews:
     """Return the posterior given one calibrated camera above a known floor."""
-    own = LevelCamera(view.camera.focal, view.camera.centre)
-    seen = settings.lift(view.keypoints, fps, own, view.camera.pitch, guess)
+    camera = LevelCamera(view.camera.focal, view.camera.centre)
+    seen = settings.lift(view.keypoints, fps, camera, view.camera.pitch, guess)
     scale, spread = settings.size
     # The height of the camera in units of the body's size tells the size.
     height = view.camera.position[1]
@@ -273,8 +273,8 @@ def _placed(view: CalibratedView, fps: float, guess: float, settings: _Settings)
     check_size(scale)
     turn = rotation(view.camera.heading).T
     mean = scale * seen.mean @ turn + view.camera.position
-    for draw, own in zip(seen.draws, _sizes(spread, settings), strict=True):
-        draw[:] = scale * (draw * own) @ turn + view.camera.position
+    for draw, size in zip(seen.draws, _sizes(spread, settings), strict=True):
+        draw[:] = scale * (draw * size) @ turn + view.camera.position
     return LiftedViews(mean, seen.draws, seen.noise, [view.keypoints], seen.checks)
 
 

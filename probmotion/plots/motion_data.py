@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -36,7 +36,8 @@ class Shown:
     The first row determines the scale. If ``turned`` and the problem has no observations or truth,
     motions are rotated to a common heading and single poses are aligned with the first pose. If
     ``overlaid``, draws of a row are shown on top of each other, and colours of the first draw are
-    standard deviations over all draws; the first two rows determine the scale.
+    standard deviations over all draws, or those of ``sds`` (L, J, 3) by label, metres; the first
+    two rows determine the scale.
     """
 
     problem: StoredProblem
@@ -44,6 +45,7 @@ class Shown:
     step: int = 1
     turned: bool = True
     overlaid: bool = False
+    sds: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def frames(self) -> int:
@@ -78,7 +80,10 @@ def motion_numbers(shown: Shown) -> dict[str, Any]:
     sides = joint_sides(skeleton)
     sds: list[np.ndarray | None] = [None] * len(rows)
     if shown.overlaid:
-        sds = [_standard_deviation(motions) for motions in rows.values()]
+        sds = [
+            _joint_sd(shown.sds[label][::step]) if label in shown.sds else _sd_of_draws(motions)
+            for label, motions in rows.items()
+        ]
         rows = {label: motions[:_MAX_OVERLAID] for label, motions in rows.items()}
     length = np.mean([_total_bone_length(motions, skeleton) for motions in scaling])
     data: dict[str, Any] = {
@@ -109,11 +114,14 @@ def motion_numbers(shown: Shown) -> dict[str, Any]:
     return data
 
 
-def _standard_deviation(motions: np.ndarray) -> np.ndarray | None:
+def _sd_of_draws(motions: np.ndarray) -> np.ndarray | None:
     """Return the standard deviation of each joint's position, (L, J), millimetres."""
-    if len(motions) < 2:
-        return None
-    return np.asarray(1000 * np.sqrt(motions.var(axis=0, ddof=1).sum(axis=-1)))
+    return None if len(motions) < 2 else _joint_sd(motions.std(axis=0, ddof=1))
+
+
+def _joint_sd(sd: np.ndarray) -> np.ndarray:
+    """Return the standard deviation of positions, (L, J), mm, from coordinates' (L, J, 3), m."""
+    return np.asarray(1000 * np.sqrt((sd**2).sum(axis=-1)))
 
 
 def _largest(sds: Sequence[np.ndarray | None]) -> float:

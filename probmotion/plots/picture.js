@@ -46,7 +46,7 @@
       shown = frame;
       draw(frame);
       const number = step * frame;
-      code.textContent = (seeds[number] ? commands.start : commands.refused).replace("FRAME", number);
+      code.textContent = (seeds[number] ? commands.start : commands.refused).join(number);
     }
     requestAnimationFrame(follow);
   };

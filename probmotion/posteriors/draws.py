@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from probmotion.files import written_whole
+from probmotion.files import UNSEALED, sealed, write_seal, written_whole
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.arviz_groups import observation_groups, posterior_groups
@@ -24,7 +24,7 @@ from probmotion.validation import check_count, check_finite, check_positive, che
 if TYPE_CHECKING:
     from probmotion.posteriors.posterior import MotionPosterior
 
-__all__ = ["MotionDraws", "library_versions", "settings_of"]
+__all__ = ["MotionDraws", "check_same_run", "library_versions", "settings_of"]
 
 _VERSION = 1  # of the file format
 _DIMS: tuple[str, ...] = ("chain", "draw", "frame", "joint", "axis")  # of positions
@@ -244,7 +244,9 @@ class MotionDraws:
             if isinstance(value, int) and not -(2**31) <= value < 2**31
         }
         with written_whole(Path(path)) as unfinished:
-            self.dataset.assign_attrs(large).to_netcdf(unfinished, engine="scipy")
+            stored = self.dataset.assign_attrs(large, checksum=UNSEALED)
+            stored.to_netcdf(unfinished, engine="scipy")
+            write_seal(unfinished)
 
     @classmethod
     def load(cls, path: str | Path) -> MotionDraws:
@@ -259,6 +261,9 @@ class MotionDraws:
         got = dataset.attrs.get("format_version")
         if got != _VERSION:
             raise ValueError(f"{path} must have format version {_VERSION}, got {got}")
+        seal = dataset.attrs.pop("checksum", None)  # files of earlier versions have none
+        if seal is not None and sealed(Path(path), str(seal)) != seal:
+            raise ValueError(f"{path} is damaged: the checksum does not match")
         try:
             counts = [name for name in dataset.attrs if str(name).startswith("evaluations_")]
             draws = cls(dataset.assign_attrs({n: int(dataset.attrs[n]) for n in ["seed", *counts]}))
@@ -286,6 +291,23 @@ def _with_prefix(prefix: str, entries: Mapping[Any, Any]) -> dict[str, Any]:
     """Return the entries with names that begin with ``prefix``, without the prefix."""
     names = [str(name) for name in entries if str(name).startswith(prefix)]
     return {name.removeprefix(prefix): entries[name] for name in names}
+
+
+def check_same_run(sampler: Any, initial: MotionDraws, chains: int, seed: int) -> None:
+    """Raise ``ValueError`` unless ``initial`` has this sampler, seed and number of chains."""
+    attributes = initial.dataset.attrs
+    settings = settings_of(sampler)
+    for name, value, earlier in (
+        ("sampler", sampler.name, attributes["sampler"]),
+        ("settings", settings, json.loads(attributes["settings"])),
+        ("seed", seed, int(attributes["seed"])),
+        ("chains", chains, initial.dataset.sizes["chain"]),
+    ):
+        if value != earlier:
+            raise ValueError(
+                f"{name} must be {earlier}, as in the run to be continued, got {value}; start a "
+                "new run to change it"
+            )
 
 
 def settings_of(sampler: Any) -> dict[str, Any]:

@@ -18,7 +18,7 @@ import numpy as np
 
 from probmotion import seeds
 from probmotion.arrays import Array, to_numpy
-from probmotion.files import read_arrays, read_json
+from probmotion.files import read_arrays, read_json, write_errors, write_json
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.protocols import HasLogDensity
 from probmotion.posteriors.truncation import TruncatedPosterior
@@ -107,14 +107,14 @@ class StoredReference:
     def save(self, folder: str | Path) -> Path:
         """Write both files into ``folder``; if writing fails, an earlier reference is preserved."""
         folder = Path(folder)
-        try:
+        json.dumps(self.certificate, allow_nan=False)  # raises ValueError for NaN
+        with write_errors(folder):
             folder.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=folder.parent) as temporary:
                 new, old = Path(temporary, "new"), Path(temporary, "old")
                 new.mkdir()
                 np.savez_compressed(new / _DRAWS, positions=self.positions.astype(np.float32))
-                text = json.dumps(self.certificate, indent=1, allow_nan=False)
-                (new / _CERTIFICATE).write_text(text + "\n", encoding="utf-8")
+                write_json(new / _CERTIFICATE, self.certificate)
                 try:
                     if folder.exists():
                         folder.rename(old)
@@ -123,9 +123,6 @@ class StoredReference:
                     if old.exists() and not folder.exists():
                         old.rename(folder)
                     raise
-        except OSError as error:
-            reason = error.strerror or error
-            raise OSError(f"cannot write {folder}: {reason}; choose a writable folder") from error
         return folder
 
     @classmethod

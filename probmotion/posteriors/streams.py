@@ -10,16 +10,21 @@ it would have made.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from probmotion.files import forget_killed, writable_folder
-from probmotion.posteriors.draws import MotionDraws
+from probmotion.arrays import to_numpy
+from probmotion.files import (
+    LOCK,
+    forget_killed,
+    locked_folder,
+    writable_folder,
+    write_errors,
+)
+from probmotion.posteriors.draws import MotionDraws, check_same_run
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.sampling import Interrupted, Sampler, progress_bar
 from probmotion.validation import check_count
@@ -27,7 +32,8 @@ from probmotion.validation import check_count
 __all__ = ["open_draws", "stream_draws"]
 
 _BLOCK_BYTES = 2**26  # of a block of draws
-_DRAWS, _LAST, _LOCK = "draws.zarr", "last.nc", ".lock"
+_CHUNKS = 16  # per block, so that short runs have small files
+_DRAWS, _LAST = "draws.zarr", "last.nc"
 _AXES = ("chain", "draw")
 
 
@@ -61,19 +67,23 @@ def stream_draws(
     ------
     ValueError
         If the folder has other files or another run, or another process writes to it.
+    OSError
+        If the folder cannot be written to; the complete draws remain.
     Interrupted
         On Ctrl-C, with the finished draws, which are stored.
     """
+    from probmotion.extras import zarr
+
     check_count("draws", draws)
     check_count("chains", chains)
-    folder = writable_folder(Path(path))
+    folder = writable_folder(Path(path), "stream")
+    forget_killed(folder)
     files = {file.name for file in folder.iterdir()}
     # A run that was killed in its first block leaves a lock and incomplete draws.
-    if _LAST not in files and files and (_LOCK not in files or files - {_LOCK, _DRAWS}):
+    if _LAST not in files and files and (LOCK not in files or files - {LOCK, _DRAWS}):
         raise ValueError(f"stream must be a new folder or one of a run, got {str(path)!r}")
-    with _locked(folder), progress_bar(draws, sampler.name, progress) as bar:
-        forget_killed(folder)
-        for unfinished in folder.glob(f"{_DRAWS}/*/*.partial"):
+    with locked_folder("stream", folder), progress_bar(draws, sampler.name, progress) as bar:
+        for unfinished in (folder / _DRAWS).rglob("*.partial"):
             unfinished.unlink()
         last = _last_of(folder)
         if last is None and (folder / _DRAWS).exists():
@@ -81,22 +91,41 @@ def stream_draws(
         done = _number(last)
         if last is not None:
             _check_same(sampler, posterior, last, chains, seed)
+            _opened(folder, last, done)  # refuses damaged draws
             bar.update(min(done, draws))
         block = _block(posterior, chains)
         while done < draws:
             # Blocks begin at multiples of their length, also after an interruption.
             length = min(block - done % block, draws - done)
-            options = {"draws": length, "chains": chains, "seed": seed, "progress": False}
+            options: dict[str, Any] = {
+                "draws": length,
+                "chains": chains,
+                "seed": seed,
+                "progress": False,
+            }
             interrupted = False
             try:
                 new = sampler.sample(posterior, initial=last, **options)
             except Interrupted as stop:
                 new, interrupted = stop.draws, True
-            last = _store(folder, new, last, done, draws, block)
+            except KeyboardInterrupt as stop:
+                if last is None:
+                    raise
+                raise Interrupted(_opened(folder, last, done)) from stop
+            # A missing chunk would be read as zeros, so chunks of zeros are written too.
+            with write_errors(folder), zarr.config.set({"array.write_empty_chunks": True}):
+                group = zarr.open_group(folder / _DRAWS, mode="a", zarr_format=2)
+                _write(group, new, done, draws, block)
+            last = _complete(folder, new, last, done)
             bar.update(_number(last) - done)
             done = _number(last)
             if interrupted:
                 raise Interrupted(_opened(folder, last, done))
+            if done < draws and not last.state:
+                raise ValueError(
+                    f"draws must be at most {done} per chain for {sampler.name}, whose runs cannot "
+                    f"be continued, got {draws}"
+                )
         assert last is not None
         return _opened(folder, last, draws)
 
@@ -130,7 +159,7 @@ def _number(last: MotionDraws | None) -> int:
 def _block(posterior: MotionPosterior, chains: int) -> int:
     """Return the number of draws per block, which only depends on the size of a draw."""
     size = posterior.frames * posterior.skeleton.n_joints * 3 + posterior.dim
-    return max(1, _BLOCK_BYTES // (8 * chains * size))
+    return _CHUNKS * max(1, _BLOCK_BYTES // (8 * _CHUNKS * chains * size))
 
 
 def _check_same(
@@ -144,26 +173,32 @@ def _check_same(
             f"stream must have draws of {expected} chains, frames and joints, got {got}; use "
             "another folder"
         )
-    if not last.independent or last.dataset.attrs["sampler"] != sampler.name:
-        return  # the sampler compares its state and settings
-    # Independent draws leave no trace of the posterior but themselves.
-    before = MotionDraws(last.dataset.assign(state_draws=last.dataset["state_draws"] - 1))
-    options = {"draws": 1, "chains": chains, "seed": seed, "progress": False}
-    again = sampler.sample(posterior, initial=before, **options)
-    if not np.allclose(again.positions.values, last.positions.values, rtol=0, atol=1e-6):
+    check_same_run(sampler, last, chains, seed)
+    if not last.state:
+        raise ValueError(
+            f"stream must be a new folder for {sampler.name}, whose runs cannot be continued"
+        )
+    if not last.independent:
+        theta, stored = last.dataset["theta"].values[:, 0], last.dataset["log_density"].values[:, 0]
+        # If densities are estimated, the state contains deterministic densities for comparison.
+        known = last.state.get("fixed", stored)
+        same = np.allclose(to_numpy(posterior.log_density(theta)), known, rtol=1e-6, atol=1e-6)
+    else:
+        # Independent draws leave no trace of the posterior but themselves.
+        before = MotionDraws(last.dataset.assign(state_draws=last.dataset["state_draws"] - 1))
+        options: dict[str, Any] = {"draws": 1, "chains": chains, "seed": seed, "progress": False}
+        again = sampler.sample(posterior, initial=before, **options).positions
+        same = np.allclose(again, last.positions, rtol=0, atol=1e-6)
+    if not same:
         raise ValueError(
             "stream must have draws of the same posterior, got others; use another folder"
         )
 
 
-def _store(
-    folder: Path, new: MotionDraws, last: MotionDraws | None, done: int, total: int, block: int
-) -> MotionDraws:
-    """Write a block and then the number of complete draws; return the last draw."""
-    import zarr
-    from numcodecs import CRC32C
+def _write(group: Any, new: MotionDraws, done: int, total: int, block: int) -> None:
+    """Write a block to a Zarr group."""
+    from probmotion.extras import numcodecs
 
-    group = zarr.open_group(folder / _DRAWS, mode="a", zarr_format=2)
     rows = slice(done, done + new.dataset.sizes["draw"])
     for key, variable in new.dataset.data_vars.items():
         name = str(key)
@@ -174,17 +209,21 @@ def _store(
             array = group.create_array(
                 name,
                 shape=shape,
-                chunks=(shape[0], min(block, total), *shape[2:]),
+                chunks=(shape[0], block // _CHUNKS, *shape[2:]),
                 dtype=variable.dtype,
-                compressors=CRC32C(),
+                compressors=numcodecs.CRC32C(),
                 attributes={"_ARRAY_DIMENSIONS": list(variable.dims)},
             )
         array = group[name]
-        assert isinstance(array, zarr.Array)
         if array.shape[1] < total:
             array.resize(shape)
         array[:, rows] = variable.values
-    kept = new.dataset.isel(draw=[-1]).assign_coords(draw=[rows.stop - 1])
+
+
+def _complete(folder: Path, new: MotionDraws, last: MotionDraws | None, done: int) -> MotionDraws:
+    """Write the number of complete draws, after a block; return the last draw."""
+    number = done + new.dataset.sizes["draw"]
+    kept = new.dataset.isel(draw=[-1]).assign_coords(draw=[number - 1])
     attributes = dict(kept.attrs)
     if last is not None:
         for name, value in last.dataset.attrs.items():
@@ -197,23 +236,39 @@ def _store(
 
 def _opened(folder: Path, last: MotionDraws, draws: int) -> MotionDraws:
     """Return the first draws of a store, without reading them."""
-    dataset = xr.open_zarr(folder / _DRAWS, consolidated=False, chunks=None, zarr_format=2)
+    from probmotion.extras import zarr  # noqa: F401 (xarray imports it, but names no extra)
+
+    store = folder / _DRAWS
+    try:
+        dataset = xr.open_zarr(
+            store, consolidated=False, chunks=None, zarr_format=2, mask_and_scale=False
+        )
+    except Exception as error:  # of damaged files, of many types
+        raise ValueError(f"{store} is damaged: {str(error)[:200]}") from error
+    for name, variable in last.dataset.data_vars.items():
+        if variable.dims[:2] == _AXES:
+            _check_stored(store / str(name), dataset.get(name), variable, draws)
     rest = last.dataset.drop_dims("draw")
     opened = dataset.isel(draw=slice(draws)).assign(rest.data_vars)
-    coordinates = {name: last.dataset[name] for name in ("chain", "frame", "joint", "axis")}
+    shared = ("chain", "frame", "joint", "axis")
+    coordinates: dict[str, Any] = {name: last.dataset[name] for name in shared}
     coordinates["draw"] = np.arange(draws)
     return MotionDraws(opened.assign_coords(coordinates).assign_attrs(last.dataset.attrs))
 
 
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    from filelock import FileLock, Timeout
-
-    lock: Any = FileLock(folder / _LOCK, blocking=False)
-    try:
-        with lock:
-            yield
-    except Timeout as error:
-        raise ValueError(
-            f"stream must not be in use, got {str(folder)!r}, to which another process writes"
-        ) from error
+def _check_stored(
+    folder: Path, stored: xr.DataArray | None, last: xr.DataArray, draws: int
+) -> None:
+    """Raise ``ValueError`` unless a variable has all its draws; those missing are read as zeros."""
+    if (
+        stored is None
+        or stored.dims != last.dims
+        or stored.isel(draw=slice(1)).shape != last.shape
+        or stored.sizes["draw"] < draws
+        or not stored.dtype.isnative
+    ):
+        raise ValueError(f"{folder} is damaged: it must have {draws} draws of {last.sizes}")
+    for number in range(-(-draws // stored.encoding["chunks"][1])):
+        chunk = folder / f"0.{number}{'.0' * (stored.ndim - 2)}"
+        if not chunk.exists():
+            raise ValueError(f"{folder} is damaged: the draws in {chunk.name} are missing")

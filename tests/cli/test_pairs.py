@@ -17,9 +17,20 @@ NAMES = [
 PERSON = Skeleton.preset("person17")
 
 
+def _landmarks(points):
+    """Return landmarks of MediaPipe, relative to an image of 2000 by 1000 pixels."""
+    result = []
+    for name in Skeleton.preset("mediapipe33").canonical_names:
+        name = "head" if name in ("nose", "left_ear", "right_ear") else name
+        known = name in PERSON.joint_names
+        x, y = points[PERSON.index(name)] / [2000, 1000] if known else (0.0, 0.0)
+        result.append({"x": x, "y": y, "visibility": 0.9 * known})
+    return result
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Write COCO results of two dancers, of one of them, and 3D seeds; return their folder."""
+    """Write keypoints of two dancers, of one of them, and with a spectator, and 3D seeds."""
     path = tmp_path_factory.mktemp("dance")
     coco = Skeleton.preset("coco17")
     dance = synthetic_dances(1, frames=310, seed=5)[0]
@@ -36,9 +47,14 @@ def folder(tmp_path_factory):
                 x, y = points[PERSON.index(name)] if known else (0.0, 0.0)
                 values += [x, y, 0.9 * known]
             results.append({"image_id": f"{frame}.jpg", "idx": person, "keypoints": values})
-    for name, people in (("two", (0, 1)), ("one", (0,))):
-        chosen = [each for each in results if each["idx"] in people]
+    spectator = [{**each, "idx": 2} for each in results if each["idx"] == 0]
+    for name, people in (("two", (0, 1)), ("one", (0,)), ("three", (0, 1, 2))):
+        chosen = [each for each in [*spectator, *results] if each["idx"] in people]
         (path / f"{name}.json").write_text(json.dumps(chosen), encoding="utf-8")
+    frames = [
+        {"pose_landmarks": [_landmarks(points) for points in np.split(pair, 2)]} for pair in pixels
+    ]
+    (path / "media.json").write_text(json.dumps(frames), encoding="utf-8")
     (path / "empty.json").write_text("[]", encoding="utf-8")
     seed = synthetic_dances(1, seed=11)[0].window(40, 1)
     save(seed, path / "seed.bvh")
@@ -53,16 +69,31 @@ def test_a_video_and_a_seed_become_pairs(capsys, folder, tmp_path):
     bvh = str(folder / "seed.bvh")
     for name, seed in (("one", [bvh]), ("two", people), ("swapped", [bvh, "--swap-people"])):
         assert main([*words, "--seed", *seed, "--out", str(tmp_path / name)]) == 0
-        assert "310 annotations" in capsys.readouterr().out
+        assert "from 52 of its 310 frames" in capsys.readouterr().out
         assert sorted(path.name for path in (tmp_path / name).iterdir()) == NAMES
     one, two, swapped = (
         load(tmp_path / name / "pairs.npz").positions for name in ("one", "two", "swapped")
     )
     np.testing.assert_allclose(one, two, atol=1e-4)  # a BVH file is rounded
     assert np.abs(swapped[:, 17:, 0] - one[:, :17, 0]).mean() < 0.05
-    assert f"{(tmp_path / 'one' / 'pairs.npz').as_posix()}" in (
-        tmp_path / "one" / "pairs.html"
-    ).read_text(encoding="utf-8")
+    assert load(tmp_path / "one" / "pairs.npz").name == "two"
+
+
+def test_people_are_chosen_and_landmarks_need_the_size_of_the_image(fails, folder, tmp_path):
+    words = ["--fps", "30", "--draws", "2", "--seed", str(folder / "seed.bvh"), "--out"]
+    media = ["media.json", "--people", "2"]
+    cases = {
+        "two": ["two.json"],
+        "three": ["three.json", "--persons", "1", "0", "--swap-people"],
+        # People without ids are numbered from the left.
+        "media": [*media, "--image-size", "2000", "1000", "--swap-people"],
+    }
+    for name, (file, *options) in cases.items():
+        assert main(["pairs", str(folder / file), *options, *words, str(tmp_path / name)]) == 0
+    two, three, landmarks = (load(tmp_path / name / "pairs.npz").positions for name in cases)
+    np.testing.assert_array_equal(three, two)
+    assert np.abs(landmarks - two).mean() < 0.02
+    assert "--image-size" in fails("pairs", folder / media[0], *media[1:], *words, tmp_path / "out")
 
 
 def test_errors_are_one_line_and_leave_no_files(fails, folder, tmp_path):
@@ -70,6 +101,9 @@ def test_errors_are_one_line_and_leave_no_files(fails, folder, tmp_path):
     seed = folder / "seed.bvh"
     cases = {
         ("one.json", "--seed", seed): "tracks must be of two people, got 1",
+        ("three.json", "--seed", seed): "got 3; of more, choose two (--persons I J)",
+        ("three.json", "--seed", seed, "--persons", "1", "3"): "indices of 0 to 2, got 1 and 3",
+        ("three.json", "--seed", seed, "--persons", "1", "1"): "indices of 0 to 2, got 1 and 1",
         ("empty.json", "--seed", seed): "expected",
         ("none.json", "--seed", seed): "must be an existing file",
         ("two.json", "--seed", folder / "person0.npz"): "must have 2 roots, one per person, got 1",

@@ -17,6 +17,7 @@ from probmotion.interaction.annotations import Annotations
 from probmotion.io.files import load
 from probmotion.lifting import LiftedPairs, lift_pairs
 from probmotion.models.unseen_depth import AnnotationPrior
+from probmotion.models.unseen_depth.view_cells import OneDirectionError
 from probmotion.motion.motion import KeypointTrack, Motion
 from probmotion.motion.skeleton import Skeleton
 
@@ -46,8 +47,8 @@ def lifted() -> LiftedPairs:
 
 @pytest.fixture(scope="module")
 def folder(lifted, tmp_path_factory):
-    """Return the folder of a saved lift."""
-    path = tmp_path_factory.mktemp("pairs")
+    """Return the folder of a saved lift, whose name is that of the page's placeholder."""
+    path = tmp_path_factory.mktemp("FRAME")
     lifted.save(path)
     return path
 
@@ -79,6 +80,11 @@ def test_outliers_are_left_out_and_short_gaps_filled(lifted):
     truth = DANCE.positions[..., :2]
     moved = lifted.keypoints - truth - np.nanmedian(lifted.keypoints - truth, axis=(0, 1))
     assert np.nanquantile(np.linalg.norm(moved, axis=-1), 0.999) < 0.25
+
+
+def test_outliers_are_left_out_at_low_frame_rates():
+    slow = replace(DANCE, positions=DANCE.positions[::6], fps=5.0)
+    assert 0.02 < lift_pairs(filmed(slow), SEED, draws=2, progress=False).outliers < 0.1
 
 
 def test_people_may_be_in_the_other_order(lifted):
@@ -128,6 +134,8 @@ def test_the_page_shows_each_frame_and_a_command_that_runs(folder, lifted, tmp_p
         assert browser.value(picture) != seen
         assert browser.errors() == []
     (data,) = re.findall(r'json">({"fps".*?)</script>', text)
+    sd = np.frombuffer(base64.b64decode(json.loads(data)["sds"][0]), "<i2").reshape(-1, 34)
+    np.testing.assert_allclose(sd, 1000 * np.linalg.norm(lifted.sd, axis=-1), atol=0.51)
     shown = np.frombuffer(base64.b64decode(json.loads(data)["keypoints"]), "<f4").reshape(-1, 34, 2)
     np.testing.assert_allclose(shown, lifted.keypoints * [1.0, -1.0], atol=1e-5)
     assert command.endswith('"mh")')
@@ -137,6 +145,40 @@ def test_the_page_shows_each_frame_and_a_command_that_runs(folder, lifted, tmp_p
     )
     draws = scope["draws"].flat()
     assert np.linalg.norm(draws[0, 0] - lifted.mean.positions[frame], axis=-1).mean() < 0.2
+
+
+def test_the_command_of_a_relative_page_has_absolute_paths(lifted, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = lifted.report("page.html").read_text(encoding="utf-8")
+    assert f"pm.load('{(tmp_path.resolve() / 'pairs.npz').as_posix()}')" in text
+
+
+@pytest.mark.parametrize("error", [OneDirectionError("one"), np.linalg.LinAlgError("singular")])
+def test_only_one_direction_makes_the_other_order_impossible(lifted, monkeypatch, error):
+    own = AnnotationPrior.fit
+    calls = []
+
+    def fit(*arguments, **options):
+        calls.append(arguments)
+        if len(calls) == 2:
+            raise error
+        return own(*arguments, **options)
+
+    monkeypatch.setattr(AnnotationPrior, "fit", fit)
+    if isinstance(error, OneDirectionError):
+        assert lift_pairs(TRACKS, SEED, draws=2, progress=False).other_order == -np.inf
+    else:
+        with pytest.raises(np.linalg.LinAlgError, match="singular"):
+            lift_pairs(TRACKS, SEED, draws=2, progress=False)
+
+
+def test_pairs_have_the_name_of_the_video():
+    tracks = [
+        replace(track, name=f"a tango {n}") for track, n in zip(TRACKS, (10, 11), strict=True)
+    ]
+    result = lift_pairs(tracks, SEED, draws=2, progress=False)
+    assert result.mean.name == "a tango"
+    assert set(result.annotations.sources) == {"a tango"}
 
 
 def test_frames_whose_angles_are_beyond_the_limits_cannot_be_started_from(lifted, tmp_path):
@@ -158,6 +200,13 @@ ANIMAL = Skeleton([f"j{joint}" for joint in range(17)], PERSON.parents)
 LEGLESS = replace(
     TRACKS[1], confidence=TRACKS[1].confidence * (np.arange(17) != PERSON.index("left_ankle"))
 )
+DOUBTFUL = [
+    replace(
+        track,
+        confidence=track.confidence * np.where(np.arange(DANCE.frames) < 100, 1, 0.29)[:, None],
+    )
+    for track in TRACKS
+]
 SHORT = [
     replace(track, keypoints=track.keypoints[:90], confidence=track.confidence[:90])
     for track in TRACKS
@@ -168,9 +217,11 @@ SHORT = [
     ("tracks", "start", "message"),
     [
         (TRACKS[:1], SEED, "tracks must be of two people, got 1"),
-        (SHORT, SEED, "both people for at least 10 s, got 3.0 s"),
-        (filmed(STILL), SEED, "one view direction only"),
-        ([TRACKS[0], LEGLESS], SEED, "in some frames, got none of person1:left_ankle"),
+        ([*TRACKS, TRACKS[0]], SEED, r"of two people, got 3; .* two \(--persons I J\)"),
+        (SHORT, SEED, r"at least 10 s with a confidence of at least 0\.3, got 3.0 s"),
+        (DOUBTFUL, SEED, r"at least 10 s with a confidence of at least 0\.3, got 3.3 s"),
+        (filmed(STILL), SEED, "from several directions, got one direction only: .*--swap-people"),
+        ([TRACKS[0], LEGLESS], SEED, "at least 0.3, got none of person1:left_ankle"),
         (TRACKS, FAR, "people in seed must be at most 5 m apart"),
         (TRACKS, make_gait("walk", frames=2), "motion must have 2 roots, one per person, got 1"),
         ([replace(track, skeleton=ANIMAL) for track in TRACKS], SEED, "have all limb keypoints"),

@@ -30,7 +30,7 @@ __all__ = ["fingerprint"]
 # Random generators, which have no fingerprint because their state changes with every draw.
 _RANDOM = (np.random.Generator, np.random.BitGenerator, np.random.RandomState, random.Random)
 
-_RECORDED_PACKAGES = {"sklearn", *(name.replace("-", "_") for name in library_versions())}
+_RECORDED_PACKAGES = {name.replace("-", "_") for name in library_versions()}
 """Packages whose versions are recorded beside every fingerprint."""
 
 _NUMPY_GLOBAL_RANDOM = getattr(np.random.random, "__self__", None)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import json
 import os
 import platform
 import shlex
@@ -17,7 +16,7 @@ from probmotion.comparison.results.budgets import Budget, effort_of
 from probmotion.comparison.results.fingerprint import fingerprint
 from probmotion.comparison.results.folder_names import check_name
 from probmotion.comparison.results.run_results import read_result
-from probmotion.files import read_json, written_whole
+from probmotion.files import read_json, write_json
 from probmotion.posteriors.draws import library_versions
 from probmotion.posteriors.problem import Problem
 from probmotion.posteriors.sampling import Sampler
@@ -119,8 +118,14 @@ class Plan:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes on the budget."""
-        notes = (f"every sampler had {self.budget}",) if self.budget else ()
+        """Notes on the budget and on metrics without their library."""
+        notes: tuple[str, ...] = ()
+        if self.budget:
+            notes = (f"every sampler had {self.budget}",)
+        if self.versions and self.versions.keys().isdisjoint({"torch", "jax"}):
+            notes += (
+                "KSD² is not measured without gradients; run pip install 'probmotion[torch]'",
+            )
         if not self.untuned:
             return notes
         verb = "has" if len(self.untuned) == 1 else "have"
@@ -209,9 +214,7 @@ class Plan:
 
     def save(self, folder: Path) -> None:
         """Write the plan into ``folder``."""
-        with written_whole(folder / _PLAN) as unfinished:
-            stored = {"format": _FORMAT, **asdict(self)}
-            unfinished.write_text(json.dumps(stored, indent=1), encoding="utf-8")
+        write_json(folder / _PLAN, {"format": _FORMAT, **asdict(self)})
 
     @classmethod
     def load(cls, folder: Path) -> Plan:

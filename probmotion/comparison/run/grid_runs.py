@@ -28,7 +28,7 @@ from probmotion.comparison.results.run_results import (
 from probmotion.comparison.run.grid_tasks import GridTask
 from probmotion.comparison.run.memory import watched_memory
 from probmotion.comparison.run.time_limits import time_limit
-from probmotion.files import forget_killed
+from probmotion.files import forget_killed, write_json
 from probmotion.posteriors.draws import MotionDraws
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.problem import Problem
@@ -172,8 +172,7 @@ class GridRun(GridTask):
             result = RunResult(
                 *address, self.fingerprint, metrics, failure, budget, size, statistics
             )
-            with open(unfinished / RESULT, "w", encoding="utf-8") as file:
-                json.dump(_without_nan(asdict(result)), file, indent=1)
+            write_json(unfinished / RESULT, _without_nan(asdict(result)))
             if self.path.exists():
                 shutil.rmtree(self.path)
             unfinished.rename(self.path)

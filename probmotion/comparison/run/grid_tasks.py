@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -12,7 +11,7 @@ from probmotion.comparison.results.budgets import Budget, affordable
 from probmotion.comparison.results.failures import Failure, ResultNotWritten, read_failure
 from probmotion.comparison.results.run_results import RunResult
 from probmotion.comparison.run.time_limits import time_limit
-from probmotion.files import read_json, written_whole
+from probmotion.files import read_json, write_json
 from probmotion.posteriors.draws import MotionDraws
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.problem import Problem
@@ -144,7 +143,6 @@ class Pilot(GridTask):
     def _store(self, result: PilotResult) -> None:
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            with written_whole(self.path) as unfinished:
-                unfinished.write_text(json.dumps(asdict(result), indent=1), encoding="utf-8")
+            write_json(self.path, asdict(result))
         except OSError as error:
             raise ResultNotWritten(str(error)) from error

@@ -110,7 +110,8 @@ def keypoints_of_tracks(
     keypoints *= [1.0, -1.0]  # y up
     if not _shows_all(keypoints).any():
         raise ValueError(
-            f"tracks must have a frame in which all {len(tracks)} people are visible, got none"
+            f"tracks must have a frame in which all {len(tracks)} people are visible with a "
+            f"confidence of at least {least_confidence:g}, got none"
         )
     if metres_per_pixel is None:
         metres_per_pixel = _scale(keypoints, seed, skeleton, tracks[0].fps)
@@ -222,7 +223,11 @@ def _scale(keypoints: np.ndarray, seed: np.ndarray, skeleton: Skeleton, fps: flo
         if longest > 0:
             ratios.append(float(np.linalg.norm(seed[joint] - seed[parent]) / longest))
     if not ratios:
-        raise ValueError("tracks must have a visible limb bone, got none: pass metres_per_pixel")
+        raise ValueError(
+            "tracks must show both ends of a forearm, upper arm, thigh or shin in some frame, got "
+            "none: the scale is unknown; use keypoints that show limbs (annotations_of_tracks "
+            "takes metres_per_pixel instead)"
+        )
     return float(np.median(ratios))
 
 

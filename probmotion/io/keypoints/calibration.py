@@ -59,30 +59,30 @@ class Calibration:
     def matched(self, names: Sequence[str]) -> list[int]:
         """Return the index of each recording's camera, by the names of files or folders.
 
-        A name matches if it contains the camera's or is contained in it, without punctuation and
-        ``json``. Recordings none of whose names matches are in the order of the cameras, if there
-        are as many.
+        A name matches if it contains the camera's, the longest of several, or else is contained in
+        it. Punctuation and ``json`` are ignored, numbers are compared as a whole: ``trial_cam10``
+        does not match ``cam1``. Recordings none of whose names matches are in the order of the
+        cameras, if there are as many.
 
         Raises
         ------
         ValueError
-            If some names only match, two match one camera, or none matches and there are more or
-            fewer recordings than cameras.
+            If some names only match, one matches several cameras, two match one camera, or none
+            matches and there are more or fewer recordings than cameras.
         """
         cameras = [_plain(name) for name in self.names]
-        found: list[int | None] = []
-        for name in map(_plain, names):
-            fits = [v for v, own in enumerate(cameras) if name and (own in name or name in own)]
-            fits = [v for v in fits if cameras[v] == name] or fits
-            found.append(fits[0] if len(fits) == 1 else None)
-        matched = [v for v in found if v is not None]
+        found = [_fits(_plain(name), cameras) for name in names]
+        matched = [fits[0] for fits in found if len(fits) == 1]
         if len(set(matched)) == len(names):
             return matched
-        if not matched and len(names) == len(self.names):
+        if not any(found) and len(names) == len(self.names):
             return list(range(len(names)))
+        given = [
+            self.names[fits[0]] if len(fits) == 1 else "several cameras" if fits else "no camera"
+            for fits in found
+        ]
         got = ", ".join(
-            f"{name or 'no name'} ({'no camera' if v is None else self.names[v]})"
-            for name, v in zip(names, found, strict=True)
+            f"{name or 'no name'} ({what})" for name, what in zip(names, given, strict=True)
         )
         raise ValueError(
             f"keypoints must be named after the calibrated cameras {', '.join(self.names)}, or all "
@@ -137,8 +137,24 @@ def view_folders(path: Path) -> list[Path]:
 
 
 def _plain(name: str) -> str:
-    """Return the letters and digits of a name, without ``json``."""
-    return re.sub(r"[^a-z0-9]", "", name.lower()).replace("json", "")
+    """Return the letters and digits of a name without ``json``, with a space between numbers."""
+    spaced = re.sub(r"[^a-z0-9]+", " ", name.lower().replace("json", ""))
+    return re.sub(r"(?<!\d) | (?!\d)", "", spaced)
+
+
+def _fits(name: str, cameras: Sequence[str]) -> list[int]:
+    """Return the cameras that a plain name contains, the longest, or else that contain it."""
+    contained = [v for v, camera in enumerate(cameras) if _contains(name, camera)]
+    if not contained:
+        return [v for v, camera in enumerate(cameras) if _contains(camera, name)]
+    longest = max(len(cameras[v]) for v in contained)
+    return [v for v in contained if len(cameras[v]) == longest]
+
+
+def _contains(name: str, part: str) -> bool:
+    """Return whether a plain name contains another one that splits none of its numbers."""
+    edge = r"(?:(?<!\d)|(?!\d))"
+    return bool(part) and re.search(f"{edge}{part}{edge}", name) is not None
 
 
 def _is_camera(table: Any) -> bool:

@@ -24,7 +24,8 @@ In COCO annotations and OpenPose files, the listed images are the frames. The ot
 only images with a detection: the frame is the last number in the image's name, and tracks include
 all frames from the first to the last. Keypoints of confidence 0 are NaN. The visibility v of COCO
 annotations becomes the confidence v/2: 0 not labelled, 0.5 occluded, 1 visible. Confidences of
-AlphaPose, which are up to 6 in its models of COCO, are clipped to 1.
+AlphaPose, which are up to 6 in its models of COCO, are clipped to 1 in files with ``"idx"``, or
+with a ``"version"`` that begins with AlphaPose.
 """
 
 from __future__ import annotations
@@ -73,8 +74,8 @@ def read_json(
     """Read the keypoint track of every person in a JSON file or an OpenPose or MMPose folder.
 
     People are identified by ``track_id``, ``idx`` or ``person_id``; otherwise frames must contain
-    one person, unless ``people`` is given. Ids that two people of an image share (AlphaPose without
-    tracking) do not identify people. For the arguments, see
+    one person, unless ``people`` is given. An id that all people share (AlphaPose without tracking)
+    does not identify them. For the arguments, see
     :func:`~probmotion.io.files.open_keypoints`.
 
     Raises
@@ -124,9 +125,10 @@ def keypoint_file(
 
 
 def _identified(detections: list[Detection]) -> bool:
-    """Return whether people have ids that are unique in every image."""
-    ids = [(one.video, one.frame, one.person) for one in detections if one.person is not None]
-    return bool(ids) and len(set(ids)) == len(ids)
+    """Return whether people have ids, other than one that several people of an image share."""
+    ids = {one.person for one in detections}
+    images = {(one.video, one.frame) for one in detections}
+    return ids != {None} and (len(ids) > 1 or len(images) == len(detections))
 
 
 def _parsed(content: Any, path: Path) -> Parsed:
@@ -197,24 +199,24 @@ def _annotations(content: dict[str, Any], path: Path) -> Parsed:
 
 def _results(content: list[dict[str, Any]], path: Path) -> Parsed:
     """Return the detections of COCO results or AlphaPose's default format."""
+    alphapose = _all_have(content, "idx")
     detections = []
     for number, person in enumerate(content):
         where = f"{path}, [{number}]"
         location = frame_number(person.get("image_id"), f"{where}, image_id")
-        values = keypoint_values(person["keypoints"], where)
-        if values[:, 2].max() <= _HIGHEST:
-            values[:, 2] = values[:, 2].clip(max=1)
+        values = _values(person["keypoints"], alphapose, where)
         merged = person.get("idx")
         while isinstance(merged, list) and merged:
             merged = merged[0]
         track_id = _identity(person | {"idx": merged}, ("track_id", "idx"), where)
         detections.append(Detection(*location, track_id, values, where))
-    return Parsed("AlphaPose" if _all_have(content, "idx") else "COCO results", detections)
+    return Parsed("AlphaPose" if alphapose else "COCO results", detections)
 
 
 def _people(frame: dict[str, Any], video: str, number: int, where: str) -> list[Detection]:
     """Return the detections of one frame in the OpenPose or a similar AlphaPose format."""
     key = "people" if "people" in frame else "bodies"
+    alphapose = str(frame.get("version")).startswith("AlphaPose")
     detections = []
     for index, person in enumerate(_dicts(frame[key], f"{where}, {key}")):
         location = f"{where}, {key}[{index}]"
@@ -223,9 +225,17 @@ def _people(frame: dict[str, Any], video: str, number: int, where: str) -> list[
         if keypoints == []:  # only a face or a hand
             continue
         track_id = _identity(person, ("person_id", "idx", "track_id"), location)
-        values = keypoint_values(keypoints, location)
+        values = _values(keypoints, alphapose, location)
         detections.append(Detection(video, number, track_id, values, location))
     return detections
+
+
+def _values(keypoints: Any, alphapose: bool, where: str) -> np.ndarray:
+    """Return keypoints (J, 3), with confidences of AlphaPose clipped to 1."""
+    values = keypoint_values(keypoints, where)
+    if alphapose and values[:, 2].max() <= _HIGHEST:
+        values[:, 2] = values[:, 2].clip(max=1)
+    return values
 
 
 def _folder(path: Path) -> Parsed:

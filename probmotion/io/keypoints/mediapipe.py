@@ -2,14 +2,16 @@
 
 Entries of a list of frames have ``pose_landmarks`` (or ``landmarks``, ``poses``): the points
 ``{"x", "y", "visibility"}`` or ``[x, y, z, visibility]`` of one person, or a list of people; null
-if there is none. ``keypoints`` of points that are objects are landmarks too. Tables have a row per
+if there is none. In an object without ``frames``, ``poses`` has the points of one person in every
+frame; under the other names are the people of one image, or frames that are objects. ``keypoints``
+of points that are objects are landmarks too. Tables have a row per
 frame, with columns such as ``nose_x`` or ``x1``, or a row per landmark, with the columns
 ``landmark_id``, ``x``, ``y`` and ``visibility``. Frames are numbered as in
 :mod:`~probmotion.io.keypoints.frames`.
 
 Coordinates normalised to the image are scaled to pixels by its size: that of the file's header
 (``width``, ``height``) or the caller's. ``vis``, ``v``, ``score``, ``confidence`` and ``conf`` are
-other names of ``visibility``. Landmarks without it have confidence 1.
+other names of ``visibility``, from 0 to 1. Landmarks without it have confidence 1.
 """
 
 from __future__ import annotations
@@ -41,6 +43,7 @@ MEDIAPIPE = "MediaPipe Pose"
 """Name of the format."""
 
 _LANDMARKS = ("pose_landmarks", "poseLandmarks", "landmarks", "poses")
+_LISTS = ("frames", "poses")  # of frames, also of points without a key
 _VISIBILITY = ("visibility", "vis", "v", "score", "confidence", "conf")
 _LANDMARK = ("landmark_id", "landmark_index", "landmark", "landmark_name")  # columns
 _NORMALISED = 2.0  # largest median coordinate relative to the image
@@ -62,8 +65,12 @@ def read_landmarks(
         If the file is damaged, or ``image_size`` is missing.
     """
     header: dict[str, Any] = content if isinstance(content, dict) else {}
-    lists = ("frames", *_LANDMARKS)
-    entries = next((header[key] for key in lists if _are_frames(header.get(key))), None)
+    lists = [header[key] for key in _LISTS if key in header]
+    for key in _LANDMARKS:  # people of one image, unless they are objects with landmarks
+        value = header.get(key)
+        if isinstance(value, list) and any(isinstance(entry, dict) for entry in value):
+            lists.append(value)
+    entries = next((each for each in lists if _are_frames(each)), None)
     if entries is None:
         entries = [content] if header else content
     return _landmark_frames(entries, header, path, image_size) if _are_frames(entries) else None
@@ -185,7 +192,11 @@ def _landmarks(entry: Any, where: str) -> Iterator[Person]:
             else [point[0], point[1], point[3] if len(point) > 3 else 1.0]
             for point in person
         ]
-        yield matrix_of(rows, at), None
+        points = matrix_of(rows, at)
+        if (points[:, 2] > 1).any():
+            got = points[points[:, 2] > 1, 2][0]
+            raise MotionFileError(f"{at}: expected visibility of at most 1, got {got:g}")
+        yield points, None
 
 
 def _is_point(value: Any) -> bool:

@@ -141,12 +141,14 @@ def tracks_of(
         seen.setdefault(detection.video, []).append(detection.frame)
         track = grouped.setdefault((detection.video, detection.person or ""), {})
         if detection.frame in track:
-            got = "two people without track ids"
+            got, hint = "two people without track ids", "set people to track people without ids"
             if detection.person is not None:
                 got = f"person {shortened(detection.person)} twice"
+            if any(one.person != detection.person for one in detections):
+                hint = "correct or remove the ids"
             raise MotionFileError(
                 f"{detection.where}: expected unique track ids (track_id, idx or person_id), got "
-                f"{got} in frame {detection.frame}; set people to track people without ids"
+                f"{got} in frame {detection.frame}; {hint}"
             )
         track[detection.frame] = detection
     if frames is None:

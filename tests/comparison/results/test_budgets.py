@@ -12,6 +12,7 @@ from toy_samplers import SMALL, Napping, PriorDraws, Walking, count, generation,
 from probmotion import UnsupportedPosterior
 from probmotion.comparison import Budget, Comparison, compare
 from probmotion.comparison.results.budgets import affordable, effort_of
+from probmotion.files import read_json, write_json
 from probmotion.posteriors.sampling import load_sampler, sampler_names
 from probmotion.samplers import MetropolisHastings, MultiViewAncestral
 
@@ -161,7 +162,7 @@ def test_stored_pilots_of_seconds_are_not_repeated(tmp_path):
     (path,) = tmp_path.glob("pilots/*/*.json")
     stored = path.read_text()
     # Other settings, as another measurement may give them, are not mixed with stored runs.
-    path.write_text(json.dumps(json.loads(stored) | {"settings": {"rounds": 30}}))
+    write_json(path, read_json(path) | {"settings": {"rounds": 30}})
     with pytest.raises(ValueError, match="made with other settings"):
         compare(generation(), Napping(), **settings)
     path.write_text(stored)

@@ -107,7 +107,7 @@ def kill_everywhere(folder: Path) -> None:
         event = killed(out, diary, moment)
         if event is None:
             return
-        broken = [path for path in pilots(out) if not path.read_text().endswith("}")]
+        broken = [path for path in pilots(out) if not path.read_text().endswith("}\n")]
         broken += [run for run in runs(out) if not is_complete(run)]
         missing = n_runs - sum(map(is_complete, runs(out))) + (0 if pilots(out) else pilot_runs)
         before = stamps(out)

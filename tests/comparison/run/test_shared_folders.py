@@ -10,12 +10,14 @@ from toy_samplers import SMALL, PriorDraws, count, generation, monocular, start
 
 from probmotion.comparison import Comparison, compare
 from probmotion.comparison.run.locks import locked
+from probmotion.files import read_json
 from probmotion.samplers import ExactSampler
 
 HOLDER = """
 import sys, time
 from pathlib import Path
 from probmotion.comparison.run.locks import locked
+from probmotion.files import read_json
 with locked(Path(sys.argv[1]), ["generation"]):
     print("locked", flush=True)
     time.sleep(60)
@@ -72,7 +74,7 @@ def test_folders_of_other_formats_raise(tmp_path):
     sampler = PriorDraws(diary=str(diary))
     compare(generation(), sampler, out=tmp_path, **SMALL)
     plan = tmp_path / "comparison.json"
-    stored = json.loads(plan.read_text())
+    stored = read_json(plan)  # without the checksum
     first = {name: value for name, value in stored.items() if name != "format"}
     for other, version in ((stored | {"format": 7}, 7), (first, 1)):
         plan.write_text(json.dumps(other))

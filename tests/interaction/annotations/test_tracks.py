@@ -154,6 +154,9 @@ def test_tracks_with_every_joint_are_used_directly():
 
 FIRST, SECOND = detections("coco17")
 SHORT = replace(SECOND, keypoints=SECOND.keypoints[:39], confidence=SECOND.confidence[:39])
+LIMBS = ("elbow", "wrist", "knee", "ankle")
+SEEN = [not name.endswith(LIMBS) for name in SECOND.skeleton.canonical_names]
+LIMBLESS = [replace(track, confidence=track.confidence * SEEN) for track in (FIRST, SECOND)]
 BALL = KeypointTrack(np.zeros((40, 1, 2)), np.ones((40, 1)), Skeleton(["ball"], [-1]), 30.0)
 
 
@@ -163,7 +166,11 @@ BALL = KeypointTrack(np.zeros((40, 1, 2)), np.ones((40, 1)), Skeleton(["ball"], 
         ([], {}, "tracks must contain 2 tracks, one per person, got 1"),
         ([SHORT], {}, r"tracks\[1\] must have 40 frames at 30 .*, got 39 at 30"),
         ([replace(SECOND, fps=25.0)], {}, r"tracks\[1\] must have 40 .*, got 40 at 25"),
-        ([replace(SECOND, confidence=0 * SECOND.confidence)], {}, "all 2 people are visible, got"),
+        (
+            [replace(SECOND, confidence=0 * SECOND.confidence)],
+            {},
+            r"all 2 people are visible with a confidence of at least 0\.3, got none",
+        ),
         ([BALL], {}, "all limb keypoints, got a track without left_shoulder, left_elbow"),
         ([SECOND], {"metres_per_pixel": -1}, "metres_per_pixel must be a finite number above 0"),
     ],
@@ -171,3 +178,9 @@ BALL = KeypointTrack(np.zeros((40, 1, 2)), np.ones((40, 1)), Skeleton(["ball"], 
 def test_invalid_tracks_are_rejected(second, options, message):
     with pytest.raises(ValueError, match=message):
         annotations_of_tracks([FIRST, *second], SEED, **options)
+
+
+def test_tracks_without_limbs_have_no_scale():
+    with pytest.raises(ValueError, match=r"ends of a forearm, .* takes metres_per_pixel instead"):
+        annotations_of_tracks(LIMBLESS, SEED)
+    assert len(annotations(LIMBLESS)) == 40

@@ -62,9 +62,21 @@ def test_recordings_are_matched_by_name_or_else_by_order(path, names, found):
     assert read_calibration(path).matched(names) == found
 
 
-def test_names_that_contain_others_are_matched_exactly(path):
-    path.write_text(FILE.replace("cam_02", "cam_010"), encoding="utf-8")
-    assert read_calibration(path).matched(["cam010_json", "cam01_json"]) == [1, 0]
+@pytest.mark.parametrize(
+    ("cameras", "names"),
+    [
+        (("cam_01", "cam_010"), ["cam01_json", "cam010_json"]),
+        (("cam1", "cam10"), ["trial_cam1", "trial_cam10"]),
+        (("1", "2"), ["20241201_1", "20241201_2"]),
+        (("left", "left_up"), ["trial-left", "trial-left-up"]),
+        (("cam1", "cam2"), ["Trial_2_cam_1", "cam2_20241201"]),
+    ],
+)
+def test_names_are_matched_to_the_longest_with_whole_numbers(path, cameras, names):
+    text = FILE.replace("cam_01", cameras[0]).replace("cam_02", cameras[1])
+    path.write_text(text, encoding="utf-8")
+    assert read_calibration(path).matched(names) == [0, 1]
+    assert read_calibration(path).matched(names[::-1]) == [1, 0]
 
 
 @pytest.mark.parametrize(
@@ -73,6 +85,9 @@ def test_names_that_contain_others_are_matched_exactly(path):
         (["left"], r"left \(no camera\)"),
         (["cam_02", "left"], r"cam_02 \(cam_02\), left \(no camera\)"),
         (["cam_01", "cam01_json"], r"cam_01 \(cam_01\), cam01_json \(cam_01\)"),
+        (["cam_011", "cam_02"], r"cam_011 \(no camera\), cam_02 \(cam_02\)"),
+        (["cam", "cam_02"], r"cam \(several cameras\), cam_02 \(cam_02\)"),
+        (["cam02_cam01", "cam01_cam02"], r"cam02_cam01 \(several .*, cam01_cam02 \(several .*\)"),
     ],
 )
 def test_names_of_some_cameras_only_are_refused(path, names, got):

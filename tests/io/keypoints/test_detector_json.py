@@ -79,11 +79,37 @@ def test_alphapose_without_tracking(tmp_path):
     ]
 
 
-def test_confidences_of_alphapose_are_clipped(tmp_path):
-    high = FIRST[0] * [1, 1, 5]
-    (track,) = read_keypoints(written(tmp_path, [result(0, high, idx=0)]), fps=25)
-    np.testing.assert_array_equal(track.confidence[0], np.minimum(high[:, 2], 1))
-    assert (high[:, 2] > 1).any()
+def test_the_same_id_twice_is_not_tracked_anew(tmp_path):
+    content = [result(i, FIRST[i], idx=k) for i in range(4) for k in (1, 2)]
+    path = written(tmp_path, [*content, result(3, SECOND[3], idx=2)])
+    for people in (None, 2):
+        with pytest.raises(MotionFileError, match="'2' twice in frame 3; correct or remove the"):
+            read_keypoints(path, fps=25, people=people)
+
+
+HIGH = FIRST[0] * [1, 1, 5]
+VERSION = {"version": "AlphaPose v0.3"}
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        [result(0, HIGH, idx=0)],
+        {"0.jpg": VERSION | {"people": [{"pose_keypoints_2d": flat(HIGH)}]}},
+        {"0.jpg": VERSION | {"bodies": [{"joints": flat(HIGH)}]}},
+        VERSION | {"people": [{"pose_keypoints_2d": flat(HIGH)}]},
+    ],
+)
+def test_confidences_of_alphapose_are_clipped(tmp_path, content):
+    (track,) = read_keypoints(written(tmp_path, content), fps=25)
+    np.testing.assert_array_equal(track.confidence[0], np.minimum(HIGH[:, 2], 1))
+    assert (HIGH[:, 2] > 1).any()
+
+
+def test_flags_of_other_results_are_not_clipped(tmp_path):
+    flags = np.column_stack([FIRST[0, :, :2], np.arange(J) % 3])
+    (track,) = read_keypoints(written(tmp_path, [result(0, flags)]), fps=25)
+    np.testing.assert_array_equal(track.confidence[0], flags[:, 2])
 
 
 def test_names_are_sorted_by_their_numbers():

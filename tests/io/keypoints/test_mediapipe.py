@@ -157,6 +157,13 @@ def test_missing_people_and_several_people(tmp_path):
     assert len(read_keypoints(path, 30, people=2, image_size=SIZE)) == 2
 
 
+@pytest.mark.parametrize("key", ["pose_landmarks", "poseLandmarks", "landmarks"])
+def test_lists_of_points_are_people_of_one_image(tmp_path, key):
+    path = written(tmp_path, {key: [landmarks(0), landmarks(1)]})
+    tracks = read_keypoints(path, 30, people=2, image_size=SIZE)
+    assert [track.frames for track in tracks] == [1, 1]
+
+
 def test_pixels_and_landmarks_without_visibility(tmp_path):
     points = [{"x": 100 + k, "y": 200} for k in range(33)]
     path = written(tmp_path, [{"pose_landmarks": points}])
@@ -178,6 +185,11 @@ def test_pixels_and_landmarks_without_visibility(tmp_path):
         ([{"pose_landmarks": "x"}], "a.json", "person 0: expected landmarks, got 'x'"),
         ([{"pose_landmarks": [None]}], "a.json", "person 0: expected landmarks, got None"),
         ([{"pose_landmarks": [{"x": 0, "y": "1"}] * 33}], "a.json", "expected numbers between"),
+        (
+            [{"pose_landmarks": [{"x": 0, "y": 0, "conf": 95}] * 33}],
+            "a.json",
+            "person 0: expected visibility of at most 1, got 95",
+        ),
         ([FRAMES[0], 3], "a.json", "frame 1 must be an object, got 3"),
         ([{"pose_landmarks": []}], "a.json", "expected at least one person, got none"),
         ("", "a.csv", r"columns x and y of MediaPipe's 33 landmarks, got \[\]"),
