@@ -86,8 +86,9 @@ LANDMARK_TABLE = "\n".join(
             "frame",
             *(f"{name}_{axis}" for name in PRESETS["mediapipe33"].joint_names for axis in "xyv"),
         ],
-        [0, *range(99)],
-        [1, *range(99)],
+        # Pixels, and visibilities of 1.
+        [0, *(1 if k % 3 == 2 else k for k in range(99))],
+        [1, *(1 if k % 3 == 2 else k for k in range(99))],
     )
 ).encode()
 CAMERAS = b"""[left]
