@@ -21,9 +21,9 @@ import probmotion as pm
 from probmotion.metrics.chains import chain_diagnostics
 
 SAMPLERS = {
-    "mh": (pm.samplers.MetropolisHastings(), 10_000),
-    "nuts": (pm.samplers.NUTS(), 10_000),
-    "ancestral3d": (pm.samplers.Ancestral3D(), 200),
+    "mh": (pm.samplers.MetropolisHastings(), 1_500),
+    "nuts": (pm.samplers.NUTS(), 4_000),
+    "ancestral3d": (pm.samplers.Ancestral3D(), 100),
 }
 
 
