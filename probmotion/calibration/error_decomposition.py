@@ -7,7 +7,7 @@ The part of a component is the difference of the samplers' error measures (T: st
 - ``discretisation``: from 10 T to T steps
 - ``integrator``: from the second-order integrator and levels of `ancestral3d` to those of `mas`
 - ``single view``: from the 3D denoiser to `mas` with exact 2D denoisers, both given observations
-- ``noise sharing``: from noise shared by all views to independent noise in each view
+- ``independent noise``: from noise shared by all views to independent noise in each view
 - ``guidance``: from conditional to unconditional, guided denoising, if there are observations
 - ``network``: from the exact to a learnt 2D denoiser
 
@@ -73,7 +73,7 @@ def decompose_error(
         Settings of `mas`: n_views, elevation, view_weights, levels, integrator,
         guidance, batch.
     shared_noise : bool, optional
-        Whether `mas` projects one 3D noise into all views, which removes the noise-sharing part.
+        Whether `mas` projects one 3D noise into all views, which removes the part of independent noise.
         True by default if there are observations, because guidance requires it.
     learnt : MotionPrior, optional
         Prior of the same motions with a learnt 2D denoiser, e.g. from
@@ -162,10 +162,10 @@ def _chain(
     notes = []
     last = links[-1].sampler
     if shared:
-        notes.append("no noise-sharing part: one 3D noise is projected into all views")
+        notes.append("no part of independent noise: one 3D noise is projected into all views")
     else:
         last = Mas(steps=steps, shared_noise=False, **settings)
-        links.append(_Link("noise sharing", last, inside))
+        links.append(_Link("independent noise", last, inside))
     if likelihood is None:
         notes.append("no guidance part: there are no observations")
     else:

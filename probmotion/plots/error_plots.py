@@ -33,7 +33,7 @@ _COLOURS = {
     "discretisation": CYCLE[6],
     "integrator": CYCLE[2],
     "single view": CYCLE[3],
-    "noise sharing": CYCLE[4],
+    "independent noise": CYCLE[4],
     "guidance": CYCLE[5],
     "network": CYCLE[1],
 }

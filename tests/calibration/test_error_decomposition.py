@@ -158,7 +158,7 @@ def test_isotropic_prior_shrinks_by_the_integrator_alone():
     limit = np.linalg.inv(np.einsum("vcx,vcy->xy", views, views))
     np.testing.assert_allclose(2 * fine - coarse, limit, atol=3e-3)
     sharing = log_trace(here, covariance_after(S, T))
-    assert spread["noise sharing"] == pytest.approx(sharing, abs=error)
+    assert spread["independent noise"] == pytest.approx(sharing, abs=error)
     assert spread["whole"] == pytest.approx(log_trace(here, S), abs=error)
     assert means(result, "mean").abs().max() < 0.01
 
@@ -198,12 +198,12 @@ def test_single_view_conditioning_shrinks_large_and_inflates_small_directions(
 
 def test_parts_add_up_exactly_seed_by_seed():
     result = decompose(problem_of(centred(1, 0.3, 0.1)), steps=5, seeds=3, draws=20)
-    assert result.parts == [*BEFORE, "single view", "noise sharing"]
+    assert result.parts == [*BEFORE, "single view", "independent noise"]
     table = result.table()
     assert list(table.columns) == ["setting", "measure", "part", "mean", "low", "high"]
     assert set(table["setting"]) == {"points, V = 5, T = 5"}
     for measure, links in result.values.items():
-        total_error = links["noise sharing"] - links["exact"]
+        total_error = links["independent noise"] - links["exact"]
         parts = np.sum(list(result.differences(measure).values()), axis=0)
         np.testing.assert_allclose(parts, total_error, atol=1e-12)
         rows = table[table["measure"] == measure].set_index("part")
