@@ -12,12 +12,7 @@ from probmotion.geometry.cameras import Cameras
 from probmotion.lifting.checks import Check
 from probmotion.lifting.keypoints import from_hips
 from probmotion.motion.motion import Motion
-from probmotion.plots.animation import (
-    CONTENT_POLICY,
-    animation_html,
-    animation_script,
-    animation_style,
-)
+from probmotion.plots.animation import animated_page, animation_html
 from probmotion.plots.motion_data import Shown
 
 __all__ = ["lift_page"]
@@ -88,29 +83,14 @@ def lift_page(
     mark = "good" if all(check.passed for check in checks) else "bad"
     summary = "".join(f"<p>{escape(sentence)}</p>" for sentence in sentences)
     count = "one camera" if cameras.n_views == 1 else f"{cameras.n_views} cameras"
-    title = escape(f"{motion.name}: 3D motion from {count}".removeprefix(": "))
-    return f"""\
-<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-{CONTENT_POLICY}
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<style>{animation_style()}{_STYLE}</style>
-</head>
-<body>
-<h1>{title}</h1>
+    title = f"{motion.name}: 3D motion from {count}".removeprefix(": ")
+    body = f"""\
+<h1>{escape(title)}</h1>
 <div class="{mark}">{summary}</div>
 {animation}
 <h2>Checks</h2>
 <table>
 <tr><th>check</th><th>value</th><th>at most</th><th>result</th></tr>
 {table}
-</table>
-<script>
-document.querySelectorAll(".animation").forEach({animation_script()});
-</script>
-</body>
-</html>
-"""
+</table>"""
+    return animated_page(title, body, _STYLE)

@@ -16,12 +16,7 @@ import numpy as np
 from probmotion.comparison.results.stored_problems import StoredProblem
 from probmotion.geometry.cameras import Cameras
 from probmotion.motion.motion import Motion
-from probmotion.plots.animation import (
-    CONTENT_POLICY,
-    animation_html,
-    animation_script,
-    animation_style,
-)
+from probmotion.plots.animation import animated_page, animation_html
 from probmotion.plots.motion_data import Shown
 
 __all__ = ["pair_page"]
@@ -104,19 +99,9 @@ def pair_page(
     # Escape "<", so that no text can end the script element.
     content = json.dumps(numbers, separators=(",", ":")).replace("<", r"\u003c")
     summary = "".join(f"<p>{escape(sentence)}</p>" for sentence in sentences)
-    title = escape(f"{name}: two people lifted from one camera")
-    return f"""\
-<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-{CONTENT_POLICY}
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<style>{animation_style()}{_STYLE}</style>
-</head>
-<body>
-<h1>{title}</h1>
+    title = f"{name}: two people lifted from one camera"
+    body = f"""\
+<h1>{escape(title)}</h1>
 {summary}
 <div class="sides">
 {animation}
@@ -128,15 +113,12 @@ def pair_page(
 <button type="button" data-does="copy">Copy</button>
 <script type="application/json">{content}</script>
 </div>
-</div>
-<script>
-document.querySelectorAll(".animation").forEach({animation_script()});
-document.querySelectorAll(".picture").forEach({_text("probmotion.plots", "picture.js")});
-document.querySelectorAll("[data-does=copy]").forEach({_text("probmotion.report", "copy.js")});
-</script>
-</body>
-</html>
-"""
+</div>"""
+    functions = {
+        ".picture": _text("probmotion.plots", "picture.js"),
+        "[data-does=copy]": _text("probmotion.report", "copy.js"),
+    }
+    return animated_page(title, body, _STYLE, functions)
 
 
 def _text(package: str, name: str) -> str:

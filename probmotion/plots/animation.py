@@ -22,17 +22,14 @@ from probmotion.plots.skeletons import checked_rows
 from probmotion.plots.style import LEFT, RIGHT
 from probmotion.validation import check_positive
 
-__all__ = [
-    "CONTENT_POLICY", "Animation", "animate_skeletons", "animation_html", "animation_script",
-    "animation_style",
-]  # fmt: skip
+__all__ = ["Animation", "animate_skeletons", "animated_page", "animation_html"]
 
-CONTENT_POLICY = (
+# Nothing is loaded from the network, and no form is sent.
+_CONTENT_POLICY = (
     '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; img-src data:; '
     "style-src 'unsafe-inline'; script-src 'unsafe-inline'; base-uri 'none'; "
     "form-action 'none'\">"
 )
-"""HTML element of every page: nothing is loaded from the network, and no form is sent."""
 
 # Width of the cell of a motion and minimum width of the page, pixels.
 _PLACE, _CONTROLS = 180, 420
@@ -111,23 +108,10 @@ def animate_skeletons(
     shown = Shown(StoredProblem(skeleton, fps), chosen, turned=False)
     captions = {label: label for label in chosen}
     heading = f"<h1>{html.escape(title)}</h1>\n" if title else ""
-    page = f"""\
-<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-{CONTENT_POLICY}
-<title>{html.escape(title or "Animated skeletons")}</title>
-<style>
-{animation_style()}h1 {{ font-size: 1.1rem; margin: 0; }}
-.cards {{ grid-template-columns: 1fr; }}
-</style></head>
-<body>
-{heading}{animation_html(title or "the skeletons", shown, captions)}
-<script>document.querySelectorAll(".animation").forEach({animation_script()});</script>
-</body>
-</html>
-"""
+    name = title or "Animated skeletons"
+    style = "h1 { font-size: 1.1rem; margin: 0; }\n.cards { grid-template-columns: 1fr; }\n"
+    body = heading + animation_html(title or "the skeletons", shown, captions)
+    page = animated_page(name, body, style)
     if path is not None:
         path = Path(path)
         if path.suffix.lower() != ".html":
@@ -138,6 +122,47 @@ def animate_skeletons(
     width = max(_PLACE * data["columns"], _CONTROLS)
     height = len(chosen) * (width * data["up"] / (data["columns"] * data["across"]) + 50)
     return Animation(page, width + 30, round(height) + (190 if title else 160))
+
+
+def animated_page(
+    title: str, body: str, style: str = "", functions: Mapping[str, str] | None = None
+) -> str:
+    """Return an HTML page whose animations play.
+
+    Parameters
+    ----------
+    title : str
+        Title, plain text.
+    body : str
+        HTML, with animations of :func:`animation_html`.
+    style : str
+        Further style sheet.
+    functions : mapping of str to str, optional
+        Further JavaScript functions, by the CSS selector of the elements that they are called with.
+    """
+    functions = {".animation": _text("animation.js"), **(functions or {})}
+    scripts = "".join(
+        f'document.querySelectorAll("{selector}").forEach({function});\n'
+        for selector, function in functions.items()
+    )
+    return f"""\
+<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+{_CONTENT_POLICY}
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{html.escape(title)}</title>
+<style>
+{_style()}{style}</style>
+</head>
+<body>
+{body}
+<script>
+{scripts}</script>
+</body>
+</html>
+"""
 
 
 def animation_html(
@@ -189,12 +214,7 @@ truth</label>
 </div>"""
 
 
-def animation_script() -> str:
-    """Return the JavaScript function that animates an element of class ``animation``."""
-    return _text("animation.js")
-
-
-def animation_style() -> str:
+def _style() -> str:
     """Return the style sheet of animations, including the colours of left and right."""
     return (
         f"{_text('animation.css')}:root {{ --left: {LEFT}; --right: {RIGHT}; }}\n"

@@ -20,7 +20,7 @@ from probmotion.comparison.results.headline_metrics import headline_metric
 from probmotion.comparison.results.table import ComparisonTable
 from probmotion.files import written_whole
 from probmotion.metrics.verdict import Verdict
-from probmotion.plots.animation import CONTENT_POLICY, animation_script, animation_style
+from probmotion.plots.animation import animated_page
 from probmotion.plots.motion_data import Shown
 from probmotion.plots.quality import plot_quality_against_cost, quality_points
 from probmotion.report.animations import BUDGET, animation, featured_problem, shown_problems
@@ -88,37 +88,20 @@ def _page(comparison: GridResults, calibration: Calibration | None) -> str:
     ]
     if calibration is not None:
         sections.append(_calibration(calibration, ranks))
-    title = escape(heading(comparison))
-    return f"""\
-<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-{CONTENT_POLICY}
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<style>
-{animation_style()}{_text("page.css")}</style>
-</head>
-<body>
+    title = heading(comparison)
+    body = f"""\
 <main>
 <header class="top">
-<h1>{title}</h1>
+<h1>{escape(title)}</h1>
 {facts(comparison)}
 </header>
 {first_screen(comparison, verdicts, outcomes, featured)}
 {chr(10).join(sections)}
 {notes(comparison)}
 {reading_guide(comparison, table)}
-</main>
-<script>
-document.querySelectorAll("table").forEach({_text("tables.js")});
-document.querySelectorAll("[data-does=copy]").forEach({_text("copy.js")});
-document.querySelectorAll(".animation").forEach({animation_script()});
-</script>
-</body>
-</html>
-"""
+</main>"""
+    functions = {"table": _text("tables.js"), "[data-does=copy]": _text("copy.js")}
+    return animated_page(title, body, _text("page.css"), functions)
 
 
 def _section(
