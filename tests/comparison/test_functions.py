@@ -6,6 +6,8 @@ import xarray as xr
 
 import probmotion as pm
 from probmotion.cli.main import main
+from probmotion.comparison import functions
+from probmotion.posteriors.draws import MotionDraws
 from probmotion.posteriors.finished import FinishedDraws
 
 NAME = "gait-monocular(frames=4)"
@@ -140,3 +142,11 @@ def test_too_few_draws_and_another_shape_are_refused():
 def test_similar_names_of_problems_are_suggested():
     with pytest.raises(ValueError, match="did you mean gait"):
         pm.problem("gaitt")
+
+
+def test_long_chains_are_thinned_before_they_are_scored(monkeypatch):
+    draws = pm.sample("gait(frames=4)", draws=60, chains=3, progress=False)
+    monkeypatch.setattr(functions, "_MAX_SCORED", 22)
+    every_third = MotionDraws(draws.dataset.isel(draw=slice(None, None, 3)))
+    expected = pm.score("gait(frames=4)", every_third)
+    assert pm.score("gait(frames=4)", draws).metrics == expected.metrics

@@ -20,6 +20,13 @@ def test_accuracies_are_those_of_scikit_learn(n, shift, rng):
         assert cross_validated_accuracy(features, labels, 5, seed) == expected
 
 
+def test_kernel_of_close_points_is_at_most_one(rng):
+    """Also if differences are lost to rounding."""
+    points = 1e3 + 1e-6 * rng.normal(size=(50, 6))
+    kernel = _kernel(points, points, 1 / (6 * points.var()))
+    assert kernel.max() <= 1
+
+
 @pytest.mark.parametrize("outlier", [1e8, 1e12])
 def test_accuracy_with_a_diverged_point_is_that_of_scikit_learn(outlier, rng):
     features, labels = rng.normal(size=(200, 6)), np.repeat([0, 1], 100)
