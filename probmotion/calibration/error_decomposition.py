@@ -73,8 +73,8 @@ def decompose_error(
         Settings of `mas`: n_views, elevation, view_weights, levels, integrator,
         guidance, batch.
     shared_noise : bool, optional
-        Whether `mas` projects one 3D noise into all views, which removes the part of independent noise.
-        True by default if there are observations, because guidance requires it.
+        Whether `mas` projects one 3D noise into all views, which removes the part of independent
+        noise. True by default if there are observations, because guidance requires it.
     learnt : MotionPrior, optional
         Prior of the same motions with a learnt 2D denoiser, e.g. from
         `probmotion.models.diffusion.projected_denoiser.denoiser_of`. The network part includes
