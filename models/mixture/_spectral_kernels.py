@@ -12,7 +12,7 @@ import numpy as np
 
 from probmotion.extras import numba
 
-__all__ = ["cross_products", "from_bases", "to_bases"]
+__all__ = ["cross_products", "from_bases", "self_products", "to_bases"]
 
 # Sums may be reordered, which the compiler needs to use vector instructions.
 _FAST = {"reassoc", "contract"}
@@ -48,6 +48,37 @@ def to_bases(
                 third = out[1][k, start : start + width].ravel()
                 for c in range(width * P):
                     third[c] -= shift[c]
+
+
+@numba.njit(cache=True, fastmath=_FAST)
+def self_products(
+    bases: tuple[np.ndarray, np.ndarray], weights: np.ndarray, edges: np.ndarray, out: np.ndarray
+) -> None:
+    """Write Σ w b_i b_j for i ≤ j over frequencies and coordinates, out (n, K, S, 6).
+
+    Weights are w (K, S, L, P); the pairs are 00, 11, 22, 01, 02, 12.
+    """
+    n, K, S, P = *out.shape[:3], weights.shape[3]
+    out[:] = 0.0
+    for k in range(K):
+        for band in range(len(edges) - 1):
+            first, width = edges[band], edges[band + 1] - edges[band]
+            for row in range(n):
+                b0, b1, b2 = _of_motion(bases, k, n, row, first, width)
+                for s in range(S):
+                    w = weights[k, s, first : first + width].ravel()
+                    s00 = s11 = s22 = s01 = s02 = s12 = 0.0
+                    for c in range(width * P):
+                        a0, a1, a2 = w[c] * b0[c], w[c] * b1[c], w[c] * b2[c]
+                        s00 += a0 * b0[c]
+                        s11 += a1 * b1[c]
+                        s22 += a2 * b2[c]
+                        s01 += a0 * b1[c]
+                        s02 += a0 * b2[c]
+                        s12 += a1 * b2[c]
+                    sums = (s00, s11, s22, s01, s02, s12)
+                    for i in range(6):
+                        out[row, k, s, i] += sums[i]
 
 
 @numba.njit(cache=True, fastmath=_FAST)

@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
-__all__ = ["cross_products", "from_bases", "to_bases"]
+__all__ = ["cross_products", "from_bases", "self_products", "to_bases"]
 
 _Bases = tuple[np.ndarray, np.ndarray]
 
@@ -28,6 +28,13 @@ def to_bases(
         np.dot(height[once], directions[1][k, band], out[1][k, once])
         raised = out[1][k, once].reshape(n, stop - first, P)
         raised -= means[k, first:stop]
+
+
+def self_products(bases: _Bases, weights: np.ndarray, edges: np.ndarray, out: np.ndarray) -> None:
+    """Write Σ w b_i b_j over frequencies and coordinates: out (n, K, S, 6), 00 11 22 01 02 12."""
+    products = np.empty((*out.shape[:3], 9))
+    cross_products(bases, bases, weights, edges, products)
+    out[:] = products[..., [0, 4, 8, 1, 2, 5]]
 
 
 def cross_products(

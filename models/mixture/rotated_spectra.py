@@ -24,9 +24,19 @@ from probmotion.extras import is_installed
 from probmotion.models.mixture.rotated_mixture import rotation_coefficients
 
 if is_installed("numba"):
-    from probmotion.models.mixture._spectral_kernels import cross_products, from_bases, to_bases
+    from probmotion.models.mixture._spectral_kernels import (
+        cross_products,
+        from_bases,
+        self_products,
+        to_bases,
+    )
 else:
-    from probmotion.models.mixture._spectral_products import cross_products, from_bases, to_bases
+    from probmotion.models.mixture._spectral_products import (
+        cross_products,
+        from_bases,
+        self_products,
+        to_bases,
+    )
 
 __all__ = ["RotatedSpectra", "blocks"]
 
@@ -107,10 +117,12 @@ class RotatedSpectra:
         self._twice = np.concatenate([2 * row + i for row in rows for i in range(2)])
         to_world = rotation_coefficients(azimuths)  # (A, 3)
         to_canonical = to_world * [1.0, -1.0, 1.0]
-        # Quadratic forms in (cos ψ, −sin ψ, 1) as products with their coefficients.
+        # Bilinear and quadratic forms in (cos ψ, −sin ψ, 1) as products with their coefficients.
+        products = to_canonical[:, :, None] * to_canonical[:, None, :]
+        self._forms = products.reshape(len(azimuths), 9).T.copy()  # (9, A)
         self._squares = np.stack(
-            [to_canonical[:, i] * to_canonical[:, j] for i in range(3) for j in range(3)]
-        )  # (9, A)
+            [products[:, i, j] * (1 if i == j else 2) for i, j in _PAIRS]
+        )  # (6, A)
         both = to_world[:, :, None] * to_canonical[:, None, :]
         self._both = both.reshape(len(azimuths), 9)
         self._last: _Level | None = None
@@ -185,8 +197,7 @@ class RotatedSpectra:
         bases[2] = bases[2] - constant(self._means.reshape(K, 1, -1), x)
         weight = constant(np.swapaxes(precision, 1, 2), x)
         gram = xp.stack([(bases[i] * bases[j]) @ weight for i, j in _PAIRS], axis=-1)
-        double = [self._squares[3 * i + j] * (1 if i == j else 2) for i, j in _PAIRS]
-        squares = gram @ constant(np.stack(double), x)  # (K, n, S, A)
+        squares = gram @ constant(self._squares, x)  # (K, n, S, A)
         offset = self._log_weights + 0.5 * np.log(precision).sum(axis=-1)
         logits = constant(offset, x)[:, None, :, None] - 0.5 * squares
         values = logsumexp(xp.reshape(xp.permute_dims(logits, (1, 0, 2, 3)), (n, -1)))
@@ -223,11 +234,14 @@ class RotatedSpectra:
         K, S, _ = self.shape
         out = np.empty((left[1].shape[1] // self.frames, K, S, 9))
         cross_products(left, right, weights, self._edges, out)
-        return (out.reshape(-1, K * S, 9) @ self._squares).reshape(-1, *self.shape)
+        return (out.reshape(-1, K * S, 9) @ self._forms).reshape(-1, *self.shape)
 
     def _logits(self, bases: _Bases, level: _Level) -> np.ndarray:
         """Return log p(k, s, a, y) up to a constant, (n, K, S, A)."""
-        logits = self._products(bases, bases, level.precision)
+        K, S, _ = self.shape
+        gram = np.empty((bases[1].shape[1] // self.frames, K, S, len(_PAIRS)))
+        self_products(bases, level.precision, self._edges, gram)
+        logits = (gram.reshape(-1, K * S, len(_PAIRS)) @ self._squares).reshape(-1, *self.shape)
         logits *= -0.5
         logits += level.offsets[..., None]
         return logits

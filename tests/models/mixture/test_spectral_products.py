@@ -29,6 +29,15 @@ def test_products_with_directions(rng):
         np.testing.assert_allclose(result, expected, atol=1e-12)
 
 
+def test_self_products_are_cross_products_of_a_motion_with_itself(rng):
+    given, weights = bases(rng), rng.normal(size=(K, S, L, P))
+    products, squares = np.empty((n, K, S, 9)), np.empty((2, n, K, S, 6))
+    compiled.cross_products(given, given, weights, EDGES, products)
+    for module, out in zip((compiled, plain), squares, strict=True):
+        module.self_products(given, weights, EDGES, out)
+        np.testing.assert_allclose(out, products[..., [0, 4, 8, 1, 2, 5]], atol=1e-11)
+
+
 def test_cross_products(rng):
     left, right, weights = bases(rng), bases(rng), rng.normal(size=(K, S, L, P))
     results = np.empty((2, n, K, S, 9))
