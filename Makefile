@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 TUTORIALS := $(wildcard notebooks/[0-9]*.py)
 
-.PHONY: install demo test slow fuzz faults lint types notebooks docs bench clean
+.PHONY: install demo test slow gpu fuzz faults lint types notebooks docs bench clean
 
 install: $(VENV)/.installed
 
@@ -34,6 +34,10 @@ fuzz: install
 	PROBMOTION_FUZZ=1000000 OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 \
 		$(BIN)/python -m pytest -n 2 --dist worksteal tests/fuzz
 
+# On a machine with CUDA.
+gpu: install
+	$(BIN)/python -m pytest -m gpu tests
+
 # Kills at 100 random moments of each program, Ctrl-C at 50; "make test" tries two. Full disks need root.
 faults: install
 	PROBMOTION_FAULTS=100 OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 \
@@ -58,8 +62,9 @@ notebooks/%.ipynb: notebooks/%.py
 docs: install
 	$(BIN)/python -m sphinx -W --keep-going -q -j 2 -b html docs docs/_build/html
 
+# Writes docs/developer/benchmarks.md, on an idle machine. Some scripts: make bench SCRIPTS='lift.py mas.py'.
 bench: install
-	for script in benchmarks/*.py; do echo "# $$script"; $(BIN)/python $$script || exit 1; done
+	$(BIN)/python benchmarks/page.py $(SCRIPTS)
 
 clean:
 	rm -rf build .types demo docs/_build *.egg-info

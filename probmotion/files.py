@@ -151,7 +151,7 @@ def locked_folder(name: str, folder: Path) -> Iterator[None]:
 
     with ExitStack() as stack:
         try:
-            stack.enter_context(FileLock(folder / LOCK, blocking=False))
+            stack.enter_context(FileLock(folder / LOCK, blocking=False, fallback_to_soft=False))
         except Timeout as error:
             raise ValueError(
                 f"{name} must not be in use, got {str(folder)!r}, to which another process writes; "

@@ -85,11 +85,11 @@ def integer(seed: int, *path: Name) -> int:
     return int(sequence(seed, *path).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
-def torch_generator(seed: int, *path: Name, device: str = "cpu") -> torch.Generator:
-    """Return the torch generator for ``seed`` and ``path``."""
+def torch_generator(seed: int, *path: Name) -> torch.Generator:
+    """Return the torch generator for ``seed`` and ``path``, on the CPU."""
     from probmotion.extras import torch
 
-    return torch.Generator(device=device).manual_seed(integer(seed, *path))
+    return torch.Generator().manual_seed(integer(seed, *path))
 
 
 def jax_key(seed: int, *path: Name) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -18,18 +19,21 @@ settings.register_profile("patient", deadline=None)
 settings.load_profile("patient")
 
 
-def pytest_configure() -> None:
-    """Enable Ctrl-C when the shell runs the tests in the background and ignores SIGINT.
+def pytest_configure(config: pytest.Config) -> None:
+    """Hide GPUs from tests of the CPU, whose results are exact there.
 
-    Child processes inherit the setting, and some tests interrupt theirs.
+    Also enable Ctrl-C when the shell runs the tests in the background and ignores SIGINT. Child
+    processes inherit both settings, and some tests interrupt theirs.
     """
+    if "gpu" not in config.option.markexpr:
+        os.environ["CUDA_VISIBLE_DEVICES"] = ""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_runtest_setup() -> None:
-    """Limit torch to one thread in every test and its fixtures.
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Limit torch to one thread in every test and its fixtures, and skip tests that need CUDA.
 
     Numba's first parallel kernel sets the number of OpenMP threads, and thereby torch's, regardless
     of OMP_NUM_THREADS; on small tensors, synchronisation makes torch ten times slower.
@@ -37,6 +41,8 @@ def pytest_runtest_setup() -> None:
     torch = sys.modules.get("torch")
     if torch is not None:
         torch.set_num_threads(1)
+        if item.get_closest_marker("gpu") and not torch.cuda.is_available():
+            pytest.skip("needs CUDA; run make gpu on a machine with it")
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from probmotion.geometry.cameras import Cameras
 from probmotion.models.diffusion.motion_transformer import MotionTransformer
 from probmotion.models.diffusion.settings import DiffusionSettings
 from probmotion.models.training.checkpoints import Checkpoint, load_weights, save_checkpoint
+from probmotion.models.training.devices import batch_tokens
 from probmotion.models.training.standardisation import Standards
 from probmotion.models.training.track_network import TrackNetwork, load_track_checkpoint
 from probmotion.motion.skeleton import Skeleton
@@ -38,8 +39,6 @@ KIND = "motion-diffusion"
 _TOKENS = 512
 # Maximum deviation of an observed root from the origin, in standard deviations of its noise.
 _ROOT_DEVIATIONS = 6.0
-# Tokens per chunk on a GPU, for 8 GiB at the paper's size.
-_GPU_TOKENS = 200_000
 
 
 class MotionDiffusion(TrackNetwork):
@@ -228,7 +227,7 @@ class MotionDiffusion(TrackNetwork):
         """Yield slices of n motions, each with all their views as one batch (n V, L, J, 2)."""
         B, V, L = views.shape[:3]
         cpu = self._device == "cpu"
-        n = max(1, (_TOKENS if cpu else _GPU_TOKENS) // (V * (L + 1)))
+        n = max(1, batch_tokens(self._device, _TOKENS) // (V * (L + 1)))
         if cpu:
             n = 1 if n < 4 else 1 << (n.bit_length() - 1)
         for start in range(0, B, n):

@@ -13,6 +13,7 @@ import numpy as np
 from probmotion.extras import torch
 from probmotion.models.evaluation.track_autoencoder import EvaluatorSettings, TrackEncoder
 from probmotion.models.training.checkpoints import Checkpoint, load_weights, save_checkpoint
+from probmotion.models.training.devices import batch_tokens
 from probmotion.models.training.track_network import TrackNetwork, load_track_checkpoint
 from probmotion.validation import check_finite, check_shape
 
@@ -21,7 +22,6 @@ __all__ = ["KIND", "EvaluatorSettings", "TrackEvaluator"]
 KIND = "track-evaluator"
 # Tokens per chunk. The fixed shape makes features independent of the batch.
 _TOKENS = 1024
-_GPU_TOKENS = 200_000
 _ENCODER = "encoder."  # Prefix of the encoder's weights in a checkpoint.
 
 
@@ -46,7 +46,7 @@ class TrackEvaluator(TrackNetwork):
             A checkpoint, with or without the decoder, the folder of a training run, or the name of
             an evaluator shipped with the package.
         device : str
-            ``cpu`` or ``cuda``.
+            ``cpu``, ``cuda``, or ``auto``: ``cuda`` where it is available, else ``cpu``.
 
         Raises
         ------
@@ -110,7 +110,7 @@ class TrackEvaluator(TrackNetwork):
         scale = np.where(varies, self.standards.deviation, 1.0)
         standardised = np.where(varies, (views - self.standards.mean) / scale, 0.0)
         features = np.empty((N, self.settings.latent))
-        n = max(1, (_TOKENS if self._device == "cpu" else _GPU_TOKENS) // (self.frames + 2))
+        n = max(1, batch_tokens(self._device, _TOKENS) // (self.frames + 2))
         for start in range(0, N, n):
             chunk = slice(start, min(start + n, N))
             size = chunk.stop - start

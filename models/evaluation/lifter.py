@@ -17,7 +17,7 @@ import numpy as np
 from probmotion import seeds
 from probmotion.extras import nn, torch
 from probmotion.models.training.checkpoints import load_checkpoint, load_weights
-from probmotion.models.training.trainer import check_device
+from probmotion.models.training.devices import check_device
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_count, check_finite, check_positive, check_shape
 
@@ -162,7 +162,7 @@ def _world_to_camera(azimuth: torch.Tensor, elevation: torch.Tensor) -> torch.Te
 
 
 class PoseLifter:
-    """Trained lifter of 2D motions of one skeleton."""
+    """Trained lifter of 2D motions of one skeleton, on a device: ``cpu``, ``cuda`` or ``auto``."""
 
     def __init__(self, network: LifterNetwork, skeleton: Skeleton, *, device: str = "cpu") -> None:
         self.skeleton = skeleton

@@ -23,6 +23,7 @@ from probmotion.models.evaluation.lifter import (
 )
 from probmotion.models.evaluation.pose_flow import PoseFlow
 from probmotion.models.evaluation.pose_flow_training import PoseTrainee
+from probmotion.models.training.devices import half_precision
 from probmotion.motion.motion import KeypointTrack
 from probmotion.motion.skeleton import Skeleton
 
@@ -156,7 +157,7 @@ class LifterTrainee(PoseTrainee):
         azimuth = torch.as_tensor(rng.uniform(0, 2 * np.pi, len(poses)), dtype=torch.float32)
         order = torch.as_tensor(rng.permutation(len(poses)))
         # Densities require single precision.
-        with torch.autocast(device.type, enabled=False):
+        with half_precision(device, False):
             terms = lifting_losses(
                 network,
                 self.flow.to(device),

@@ -11,6 +11,7 @@ import numpy as np
 from probmotion import seeds
 from probmotion.extras import nn, torch
 from probmotion.models.evaluation.pose_flow import KIND, FlowSettings, PoseFlow
+from probmotion.models.training.devices import half_precision
 from probmotion.models.training.track_batches import describe_tracks
 from probmotion.motion.motion import KeypointTrack
 
@@ -135,6 +136,6 @@ class PoseFlowTrainee(PoseTrainee):
         blurred = torch.as_tensor(poses + np.float32(self.size.blur) * noise, device=device)
         assert isinstance(network, PoseFlow)
         # Densities require single precision.
-        with torch.autocast(device.type, enabled=False):
+        with half_precision(device, False):
             density = network.log_density(blurred)
         return -density.mean() / (2 * len(network.joints))

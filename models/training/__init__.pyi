@@ -5,6 +5,7 @@ from .checkpoints import (
     load_checkpoint as load_checkpoint,
     save_checkpoint as save_checkpoint,
 )
+from .devices import check_device as check_device
 from .settings import TrainingSettings as TrainingSettings
 from .standardisation import Standards as Standards
 from .track_batches import Augmentation as Augmentation, TrackBatches as TrackBatches
@@ -12,6 +13,5 @@ from .trainer import (
     Diverged as Diverged,
     Trainee as Trainee,
     TrainingResult as TrainingResult,
-    check_device as check_device,
     train as train,
 )

@@ -10,8 +10,8 @@ import numpy as np
 
 from probmotion.extras import nn
 from probmotion.models.training.checkpoints import Checkpoint, load_checkpoint, valid_settings
+from probmotion.models.training.devices import check_device
 from probmotion.models.training.standardisation import Standards
-from probmotion.models.training.trainer import check_device
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_positive, check_shape
 
@@ -22,6 +22,9 @@ Size = TypeVar("Size")
 
 class TrackNetwork:
     """Base class of a trained network on standardised 2D data, with its training record ``card``.
+
+    ``device`` is ``cpu``, ``cuda``, or ``auto``: ``cuda`` where it is available, else ``cpu``. On
+    the CPU, batches have a fixed shape, so that results do not depend on the batch.
 
     Raises ``ValueError`` if shapes are inconsistent, ``fps`` is not positive or the device is not
     available.

@@ -24,11 +24,12 @@ from probmotion import seeds
 from probmotion.extras import nn, torch
 from probmotion.files import forget_killed, locked_folder, writable_folder
 from probmotion.models.training.checkpoints import MODEL
+from probmotion.models.training.devices import check_device, dropout_seed, half_precision
 from probmotion.models.training.runs import STATE, Run, keep_run, resume_run
 from probmotion.models.training.settings import TrainingSettings
 from probmotion.posteriors.sampling import progress_bar
 
-__all__ = ["Anneals", "Diverged", "Trainee", "TrainingResult", "check_device", "train"]
+__all__ = ["Anneals", "Diverged", "Trainee", "TrainingResult", "train"]
 
 
 class Diverged(ValueError):  # noqa: N818 (shorter than DivergenceError)
@@ -86,21 +87,12 @@ class TrainingResult:
     steps: int
 
 
-def check_device(device: str) -> torch.device:
-    """Return the device; raise ``ValueError`` unless it is ``cpu`` or an available ``cuda``."""
-    if device not in ("cpu", "cuda"):
-        raise ValueError(f"device must be cpu or cuda, got {device!r}")
-    if device == "cuda" and not torch.cuda.is_available():
-        raise ValueError("device must be cpu, got cuda, which is not available")
-    return torch.device(device)
-
-
 def train(
     trainee: Trainee,
     settings: TrainingSettings,
     out: str | Path,
     *,
-    device: str = "cpu",
+    device: str = "auto",
     progress: bool = True,
 ) -> TrainingResult:
     """Train a network; repeat the call to resume an interrupted run.
@@ -117,7 +109,7 @@ def train(
         Folder for ``model.safetensors``, ``state.safetensors`` (to resume from) and ``losses.csv``;
         created if missing. A missing or damaged model is restored from the state.
     device : str
-        ``cpu`` or ``cuda``.
+        ``cpu``, ``cuda``, or ``auto``: ``cuda`` where it is available, else ``cpu``.
     progress : bool
         Whether to show a progress bar.
 
@@ -199,8 +191,8 @@ def _take_step(
         group["lr"] = settings.rate(step)
     run.optimiser.zero_grad(set_to_none=True)
     with (
-        _seeded_dropout(settings.seed, step, device),
-        torch.autocast(device.type, torch.bfloat16, enabled=device.type == "cuda"),
+        dropout_seed(settings.seed, step, device),
+        half_precision(device, device.type == "cuda"),
     ):
         if isinstance(trainee, Anneals):
             trainee.anneal(step)
@@ -255,15 +247,6 @@ def _validate(run: Run, trainee: Trainee, device: torch.device, folder: Path) ->
     row = {"step": run.step, "loss": float(np.mean(run.recent)), "validation_loss": loss}
     run.history.append(row | {"seconds": run.seconds})
     run.recent.clear()
-
-
-@contextmanager
-def _seeded_dropout(seed: int, step: int, device: torch.device) -> Iterator[None]:
-    """Seed torch's global generator, which dropout uses, for one step; then restore it."""
-    devices = [torch.cuda.current_device()] if device.type == "cuda" else []
-    with torch.random.fork_rng(devices=devices):
-        torch.manual_seed(seeds.integer(seed, "dropout", step))
-        yield
 
 
 @contextmanager

@@ -9,7 +9,10 @@ shipped checkpoints.
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
+
 from probmotion.extras import nn, torch
+from probmotion.models.training.devices import half_precision, is_half_precision
 from probmotion.models.vae.settings import MotionVAESettings
 from probmotion.models.vae.short_attention import short_attention
 from probmotion.validation import check_shape
@@ -121,7 +124,7 @@ class Readout(nn.Linear):
 
     def forward(self, tokens: torch.Tensor) -> torch.Tensor:
         """Return the outputs, ``(…, width) → (…, outputs)``."""
-        with torch.autocast(tokens.device.type, enabled=False):
+        with half_precision(tokens.device, False):
             return super().forward(tokens.to(self.weight.dtype))
 
 
@@ -210,22 +213,20 @@ def _attend(packed: torch.Tensor, heads: int, seen: torch.Tensor | None) -> torc
     return result.transpose(1, 2).flatten(2)
 
 
-def mixed_precision(network: nn.Module, device: torch.device) -> torch.autocast:
+def mixed_precision(network: nn.Module, device: torch.device) -> AbstractContextManager[object]:
     """Return the autocast context of a network: bfloat16 in training if its settings request it.
 
     An autocast enabled by the trainer remains active.
     """
     enabled = network.settings.mixed_precision and network.training
-    enabled = enabled or torch.is_autocast_enabled(device.type)
-    return torch.autocast(device.type, torch.bfloat16, enabled=enabled)
+    return half_precision(device, enabled or is_half_precision(device))
 
 
 def _cast_tokens(tokens: torch.Tensor) -> torch.Tensor:
     """Cast joint or bone tokens to the autocast type, which halves the memory traffic of sums."""
-    kind = tokens.device.type
-    if not torch.is_autocast_enabled(kind):
+    if not is_half_precision(tokens.device):
         return tokens
-    return tokens.to(torch.get_autocast_dtype(kind))
+    return tokens.to(torch.get_autocast_dtype(tokens.device.type))
 
 
 def body_size(rest: torch.Tensor) -> torch.Tensor:

@@ -14,6 +14,7 @@ from typing import Any
 from probmotion import seeds
 from probmotion.extras import nn, torch
 from probmotion.geometry.rotations import rotation_6d_to_matrix, vector_to_matrix
+from probmotion.models.training.devices import half_precision
 from probmotion.models.vae.layers import (
     BoneDecoder,
     FrameEncoder,
@@ -92,7 +93,7 @@ class PoseNetwork(nn.Module):
             turns = self.bone_decoder(hypotheses)
             log_lengths = self.log_lengths(hypotheses.mean(dim=2))
         # Compose rotations in full precision even under autocast.
-        with torch.autocast(keypoints.device.type, enabled=False):
+        with half_precision(keypoints.device, False):
             identity = rigid.new_tensor([1.0, 0, 0, 0, 1, 0])
             rotation = rotation_6d_to_matrix(identity + rigid[..., :6]) @ self.quarters[:, None]
         return PoseHypotheses(rotation, rigid[..., 6:], turns, log_lengths)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from probmotion.extras import torch
+from probmotion.models.training.devices import half_precision
 from probmotion.models.training.track_batches import Batch, TrackBatches
 from probmotion.models.vae.layers import FRAMES_AT_ONCE
 from probmotion.models.vae.pose_network import PoseHypotheses, PoseNetwork
@@ -34,7 +35,7 @@ class TeacherForcedPoses:
         parts = zip(keypoints.split(FRAMES_AT_ONCE), seen.split(FRAMES_AT_ONCE), strict=True)
         network.eval()
         # Full precision, even if the first training step uses autocast.
-        with torch.autocast(rest.device.type, enabled=False):
+        with half_precision(rest.device, False):
             outputs = [vars(network(*part, rest)).values() for part in parts]
         rotation, translation, turns, log_lengths = map(torch.cat, zip(*outputs, strict=True))
         self._poses = PoseHypotheses(

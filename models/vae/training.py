@@ -18,6 +18,7 @@ from probmotion.extras import nn, torch
 from probmotion.models.bodies.articulated_body import ArticulatedBody
 from probmotion.models.dvae.variational_terms import gaussian_kl
 from probmotion.models.training.checkpoints import load_checkpoint, load_weights
+from probmotion.models.training.devices import half_precision
 from probmotion.models.training.runs import check_same_run
 from probmotion.models.training.settings import TrainingSettings
 from probmotion.models.training.track_batches import Augmentation, Batch, TrackBatches
@@ -114,7 +115,7 @@ class _VAETrainee(TrackTrainee):
 
         Networks use the precision of their settings; kinematics and losses use single precision.
         """
-        with torch.autocast(device.type, enabled=False):
+        with half_precision(device, False):
             return super().training_loss(network, rng, batch, device)
 
     def _inputs(

@@ -34,12 +34,12 @@ class Steps:
     seed: int = 0
     """Seed of initial weights, batches and noise."""
 
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Device; cuda uses mixed precision."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Device; auto is cuda where it is available. On cuda, training is in mixed precision."""
 
     def settings(self, defaults: TrainingSettings) -> TrainingSettings:
         """Return the default settings ``defaults``, overridden by the given options."""
-        from probmotion.models.training.trainer import check_device
+        from probmotion.models.training.devices import check_device
 
         check_device(self.device)  # early, since data preparation takes minutes
         given = {k: v for k, v in asdict(self).items() if v is not None and k != "device"}

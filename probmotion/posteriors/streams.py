@@ -27,14 +27,13 @@ from probmotion.files import (
 from probmotion.posteriors.draws import MotionDraws, check_same_run
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.sampling import Interrupted, Sampler, progress_bar
+from probmotion.posteriors.stream_arrays import AXES, CHUNKS, check_stored, write_block
 from probmotion.validation import check_count
 
 __all__ = ["open_draws", "stream_draws"]
 
 _BLOCK_BYTES = 2**26  # of a block of draws
-_CHUNKS = 16  # per block, so that short runs have small files
 _DRAWS, _LAST = "draws.zarr", "last.nc"
-_AXES = ("chain", "draw")
 
 
 def stream_draws(
@@ -114,8 +113,7 @@ def stream_draws(
                 raise Interrupted(_opened(folder, last, done)) from stop
             # A missing chunk would be read as zeros, so chunks of zeros are written too.
             with write_errors(folder), zarr.config.set({"array.write_empty_chunks": True}):
-                group = zarr.open_group(folder / _DRAWS, mode="a", zarr_format=2)
-                _write(group, new, done, draws, block)
+                write_block(folder / _DRAWS, new, done, draws, block)
             last = _complete(folder, new, last, done)
             bar.update(_number(last) - done)
             done = _number(last)
@@ -159,7 +157,7 @@ def _number(last: MotionDraws | None) -> int:
 def _block(posterior: MotionPosterior, chains: int) -> int:
     """Return the number of draws per block, which only depends on the size of a draw."""
     size = posterior.frames * posterior.skeleton.n_joints * 3 + posterior.dim
-    return _CHUNKS * max(1, _BLOCK_BYTES // (8 * _CHUNKS * chains * size))
+    return CHUNKS * max(1, _BLOCK_BYTES // (8 * CHUNKS * chains * size))
 
 
 def _check_same(
@@ -195,31 +193,6 @@ def _check_same(
         )
 
 
-def _write(group: Any, new: MotionDraws, done: int, total: int, block: int) -> None:
-    """Write a block to a Zarr group."""
-    from probmotion.extras import numcodecs
-
-    rows = slice(done, done + new.dataset.sizes["draw"])
-    for key, variable in new.dataset.data_vars.items():
-        name = str(key)
-        if variable.dims[:2] != _AXES:
-            continue
-        shape = (variable.shape[0], total, *variable.shape[2:])
-        if name not in group:
-            array = group.create_array(
-                name,
-                shape=shape,
-                chunks=(shape[0], block // _CHUNKS, *shape[2:]),
-                dtype=variable.dtype,
-                compressors=numcodecs.CRC32C(),
-                attributes={"_ARRAY_DIMENSIONS": list(variable.dims)},
-            )
-        array = group[name]
-        if array.shape[1] < total:
-            array.resize(shape)
-        array[:, rows] = variable.values
-
-
 def _complete(folder: Path, new: MotionDraws, last: MotionDraws | None, done: int) -> MotionDraws:
     """Write the number of complete draws, after a block; return the last draw."""
     number = done + new.dataset.sizes["draw"]
@@ -246,29 +219,11 @@ def _opened(folder: Path, last: MotionDraws, draws: int) -> MotionDraws:
     except Exception as error:  # of damaged files, of many types
         raise ValueError(f"{store} is damaged: {str(error)[:200]}") from error
     for name, variable in last.dataset.data_vars.items():
-        if variable.dims[:2] == _AXES:
-            _check_stored(store / str(name), dataset.get(name), variable, draws)
+        if variable.dims[:2] == AXES:
+            check_stored(store / str(name), dataset.get(name), variable, draws)
     rest = last.dataset.drop_dims("draw")
     opened = dataset.isel(draw=slice(draws)).assign(rest.data_vars)
     shared = ("chain", "frame", "joint", "axis")
     coordinates: dict[str, Any] = {name: last.dataset[name] for name in shared}
     coordinates["draw"] = np.arange(draws)
     return MotionDraws(opened.assign_coords(coordinates).assign_attrs(last.dataset.attrs))
-
-
-def _check_stored(
-    folder: Path, stored: xr.DataArray | None, last: xr.DataArray, draws: int
-) -> None:
-    """Raise ``ValueError`` unless a variable has all its draws; those missing are read as zeros."""
-    if (
-        stored is None
-        or stored.dims != last.dims
-        or stored.isel(draw=slice(1)).shape != last.shape
-        or stored.sizes["draw"] < draws
-        or not stored.dtype.isnative
-    ):
-        raise ValueError(f"{folder} is damaged: it must have {draws} draws of {last.sizes}")
-    for number in range(-(-draws // stored.encoding["chunks"][1])):
-        chunk = folder / f"0.{number}{'.0' * (stored.ndim - 2)}"
-        if not chunk.exists():
-            raise ValueError(f"{folder} is damaged: the draws in {chunk.name} are missing")

@@ -7,6 +7,7 @@ import shutil
 
 import numpy as np
 import pytest
+import zarr
 
 import probmotion as pm
 from probmotion.files import locked_folder
@@ -50,6 +51,29 @@ def test_streamed_draws_equal_those_of_one_run(name, posterior, tmp_path):
     assert streamed.skeleton == once.skeleton
     again = streams.stream_draws(sampler, posterior, tmp_path, **{**RUN, "draws": 10})
     np.testing.assert_array_equal(again.positions, streamed.positions[:, :10])
+
+
+def test_chunks_are_those_that_zarr_writes(posterior, tmp_path, monkeypatch):
+    """Also where a run is extended within a chunk, and in the last, incomplete chunk."""
+    monkeypatch.setattr(streams, "_BLOCK_BYTES", 320_000)
+    for draws in (5, 13, 40):
+        run = {**RUN, "draws": draws}
+        streamed = streams.stream_draws(SAMPLERS["mh"], posterior, tmp_path, **run)
+    ours = zarr.open_group(tmp_path / "draws.zarr", mode="r")
+    theirs = zarr.open_group(tmp_path / "zarr", mode="w", zarr_format=2)
+    with zarr.config.set({"array.write_empty_chunks": True}):
+        for name, array in ours.arrays():
+            copy = theirs.create_array(
+                name, shape=array.shape, chunks=array.chunks, dtype=array.dtype,
+                compressors=array.compressors,
+            )  # fmt: skip
+            assert array.chunks[1] == 3
+            copy[:] = streamed.dataset[name].values
+            files = sorted(path.name for path in (tmp_path / "zarr" / name).glob("0.*"))
+            assert len(files) == -(-40 // array.chunks[1])
+            for file in files:
+                written = (tmp_path / "draws.zarr" / name / file).read_bytes()
+                assert written == (tmp_path / "zarr" / name / file).read_bytes(), (name, file)
 
 
 def test_draws_are_read_when_they_are_used(posterior, tmp_path):

@@ -16,9 +16,8 @@ OpenPose               a folder of files ``{"people": [{"pose_keypoints_2d": [â€
 For other JSON, see :mod:`~probmotion.io.keypoints.mmpose` and
 :mod:`~probmotion.io.keypoints.mediapipe`.
 
-Keypoints have the layout named in the file, or else the preset with as many keypoints. Of
-COCO-WholeBody (133) and Halpe (136), the keypoints of the body are read. OpenPose's two layouts of
-25 keypoints are told apart by the lengths of their bones.
+Keypoints have the layout named in the file, or else that of
+:mod:`~probmotion.io.keypoints.layouts`.
 
 In COCO annotations and OpenPose files, the listed images are the frames. The other formats list
 only images with a detection: the frame is the last number in the image's name, and tracks include
@@ -40,6 +39,7 @@ from typing import Any
 import numpy as np
 
 from probmotion.io.errors import MotionFileError, read_bytes, shortened
+from probmotion.io.keypoints.layouts import keypoint_file
 from probmotion.io.keypoints.mediapipe import read_landmarks
 from probmotion.io.keypoints.mmpose import read_mmpose
 from probmotion.io.keypoints.tracks import (
@@ -48,20 +48,14 @@ from probmotion.io.keypoints.tracks import (
     Parsed,
     frame_number,
     keypoint_values,
-    link_people,
     named_skeleton,
     natural,
-    tracks_of,
 )
 from probmotion.motion.skeleton import Skeleton
-from probmotion.validation import check_count
 
-__all__ = ["keypoint_file", "read_json"]
+__all__ = ["read_json"]
 
-_BY_COUNT = {16: "alphapose16", 17: "coco17", 18: "openpose18", 26: "halpe26"}  # presets
-_BODY = {133: 17, 136: 26}  # keypoints of the body in COCO-WholeBody and Halpe
 _HIGHEST = 6.0  # confidence of AlphaPose
-_TWO_LAYOUTS = {25: " ('body25' or 'body25b')"}  # ambiguous keypoint counts
 
 
 def read_json(
@@ -95,40 +89,6 @@ def read_json(
             or _parsed(content, path)
         )
     return keypoint_file(parsed, path, fps, skeleton, people)
-
-
-def keypoint_file(
-    parsed: Parsed,
-    path: Path,
-    fps: float | None = None,
-    skeleton: Skeleton | None = None,
-    people: int | None = None,
-) -> KeypointFile:
-    """Return the tracks of detections whose keypoints have no names; see :func:`read_json`."""
-    detections, given = parsed.detections, skeleton or parsed.skeleton
-    counts = sorted({len(detection.values) for detection in detections})
-    if len(counts) > 1:
-        raise MotionFileError(f"{path}: expected the same number of keypoints, got {counts}")
-    if not counts:
-        raise MotionFileError(f"{path}: expected at least one person, got none")
-    if skeleton is None and counts[0] in _BODY:  # of a layout with hands and a face
-        detections = [replace(one, values=one.values[: _BODY[counts[0]]]) for one in detections]
-        counts, given = [_BODY[counts[0]]], None
-    if people is not None:
-        check_count("people", people)
-        if not _identified(detections):
-            detections = link_people(detections, people)
-    rate = parsed.fps if fps is None else fps
-    layout = _layout(detections, given, path)
-    tracks = tracks_of(detections, parsed.frames, layout, rate, path)
-    return KeypointFile(parsed.format, rate, tracks)
-
-
-def _identified(detections: list[Detection]) -> bool:
-    """Return whether people have ids, other than one that several people of an image share."""
-    ids = {one.person for one in detections}
-    images = {(one.video, one.frame) for one in detections}
-    return ids != {None} and (len(ids) > 1 or len(images) == len(detections))
 
 
 def _parsed(content: Any, path: Path) -> Parsed:
@@ -337,44 +297,6 @@ def _category_skeleton(content: dict[str, Any], path: Path) -> Skeleton | None:
         if skeletons[-1] != skeletons[0]:
             raise MotionFileError(f"{where}: expected the keypoints of the previous category")
     return skeletons[0] if skeletons else None
-
-
-def _layout(detections: list[Detection], given: Skeleton | None, path: Path) -> Skeleton:
-    """Return the given or the default skeleton of the keypoints."""
-    count = len(detections[0].values)
-    if given is None:
-        if count == 25 and (layout := _layout_of_25(detections)) is not None:
-            return Skeleton.preset(layout)
-        if count not in _BY_COUNT:
-            wanted = f"{count} keypoints{_TWO_LAYOUTS.get(count, '')}"
-            raise MotionFileError(f"{path}: skeleton must be given for {wanted}, got None")
-        return Skeleton.preset(_BY_COUNT[count])
-    if given.n_joints != count:
-        raise MotionFileError(
-            f"{path}: expected {given.n_joints} keypoints as in skeleton, got {count}"
-        )
-    return given
-
-
-def _layout_of_25(detections: list[Detection]) -> str | None:
-    """Return OpenPose's layout of 25 keypoints whose bones are at most half as long, or None.
-
-    The median ratio over all detections counts. In six real tracks of BODY_25B, and in the same
-    tracks converted to BODY_25, bones of the right layout are shorter by a factor of 2.5 to 6. In
-    3000 random orders of the keypoints, the factor is at most 1.8.
-    """
-    values = np.array([detection.values for detection in detections])
-    lengths = []
-    for layout in ("body25", "body25b"):
-        joint, parent = np.array(Skeleton.preset(layout).bones).T
-        seen = (values[:, joint, 2] > 0) & (values[:, parent, 2] > 0)
-        bones = np.linalg.norm(values[:, joint, :2] - values[:, parent, :2], axis=-1)
-        lengths.append(np.where(seen, bones, 0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1))
-    first, second = (length[np.min(lengths, axis=0) > 0] for length in lengths)
-    if not len(first):
-        return None
-    ratio = np.median(first / second)
-    return "body25" if ratio <= 0.5 else "body25b" if ratio >= 2 else None
 
 
 def _described(content: Any) -> str:

@@ -6,8 +6,9 @@ from pathlib import Path
 
 from probmotion.io.errors import MotionFileError, csv_rows, shortened
 from probmotion.io.keypoints.deeplabcut import find_table, read_csv_table, read_hdf5_table
-from probmotion.io.keypoints.detector_json import keypoint_file, read_json
+from probmotion.io.keypoints.detector_json import read_json
 from probmotion.io.keypoints.hdf5 import open_hdf5, read_movement, read_sleap
+from probmotion.io.keypoints.layouts import keypoint_file
 from probmotion.io.keypoints.mediapipe import read_landmark_table
 from probmotion.io.keypoints.tracks import KeypointFile
 from probmotion.io.npz import read_keypoint_npz

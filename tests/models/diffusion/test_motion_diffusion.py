@@ -220,7 +220,7 @@ def test_trained_priors_are_loaded_from_folder_and_file(trainee, tmp_path):
         (KIND, {"parents": None}, {}, "must contain valid motion-diffusion settings"),
         (KIND, {}, {"frames": 99}, "frames must be at most 12, the network's longest motion, got"),
         (KIND, {}, {"frames": 1}, "frames must be an integer of at least 2, got 1"),
-        (KIND, {}, {"device": "tpu"}, "device must be cpu or cuda, got 'tpu'"),
+        (KIND, {}, {"device": "tpu"}, "device must be auto, cpu or cuda, got 'tpu'"),
     ],
 )
 def test_unusable_checkpoints_are_rejected(trainee, tmp_path, kind, change, options, message):
