@@ -1,4 +1,4 @@
-"""Gaussian priors over 3D poses and motions learnt from 2D alone, with exact lifting."""
+"""What keypoints do not show: priors learnt from 2D alone, and a regression of depths."""
 
 import lazy_loader
 

@@ -1,4 +1,5 @@
 from .annotation_prior import AnnotationPrior as AnnotationPrior
 from .keypoints import AnnotationLifts as AnnotationLifts
+from .pose_depth import PoseDepth as PoseDepth
 from .smoothing import SmoothedLifts as SmoothedLifts, smoothed_lifts as smoothed_lifts
 from .track_prior import motion_prior_from_tracks as motion_prior_from_tracks

@@ -47,7 +47,7 @@ class Evidence(NamedTuple):
     """Keypoints, frame rate, camera, noise (pixels), mean (L, J, 3) and summaries of the windows.
 
     ``mirrored`` is the log evidence per window of keypoints with exchanged sides, minus that of the
-    given ones; with an estimated pitch, both include the tempered log density of the pitch.
+    given ones; an estimated pitch is that of each.
     """
 
     keypoints: PersonKeypoints
@@ -70,12 +70,13 @@ _LIMITS = {
     "noise": (0.04, "the keypoints' noise is more than 4 cm at the person's distance"),
     "residual": (1.6, "keypoints of a joint do not follow a body before a still camera"),
     "unsteady": (0.5, "feet and body move to and fro together (does the camera move?)"),
-    "posture": (1.8, "the posture is unlike those from which the prior was learnt"),
+    "posture": (2.1, "the posture is unlike those from which the prior was learnt"),
     "surprise": (2.5, "the motion is unlike those from which the prior was learnt"),
     "proportions": (3.0, "the body has unusual proportions (another animal, swapped joints?)"),
     "mirrored": (
-        0.0,
-        "the motion is more likely with left and right exchanged (is the video mirrored?)",
+        -10.0,
+        "the motion is not clearly more likely than with left and right exchanged (is the video "
+        "mirrored?)",
     ),
 }
 

@@ -7,20 +7,21 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import median_filter
 
+from probmotion.models.unseen_depth.pose_depth import KEYPOINTS
 from probmotion.motion.motion import KeypointTrack
 from probmotion.motion.retargeting import counterpart
 from probmotion.motion.skeleton import Skeleton
 
 __all__ = [
-    "LIMBS", "SIDED", "BodyPath", "PersonKeypoints", "averaged", "body_path", "from_hips",
+    "HIPS", "LIMBS", "SIDED", "BodyPath", "PersonKeypoints", "averaged", "body_path", "from_hips",
     "person_keypoints", "smooth_size",
 ]  # fmt: skip
 
 PERSON = Skeleton.preset("person14")
 # Neck and pelvis of detectors are midpoints of shoulders and hips, which motion capture has not.
 _TRUNK = ("neck", "pelvis")
-_HIPS = [PERSON.joint_names.index(f"{side}_hip") for side in ("left", "right")]
-LIMBS = [j for j, name in enumerate(PERSON.joint_names) if name not in _TRUNK]
+HIPS = [PERSON.joint_names.index(f"{side}_hip") for side in ("left", "right")]
+LIMBS = list(KEYPOINTS)
 """Joints of arms and legs."""
 SIDED = (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"))
 """Joints of an arm and of a leg."""
@@ -36,7 +37,7 @@ def from_hips(positions: np.ndarray) -> np.ndarray:
 
     Keypoints show the hips, not the pelvis.
     """
-    relative: np.ndarray = positions - positions[..., _HIPS, :].mean(axis=-2, keepdims=True)
+    relative: np.ndarray = positions - positions[..., HIPS, :].mean(axis=-2, keepdims=True)
     return relative
 
 

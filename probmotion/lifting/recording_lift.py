@@ -55,8 +55,9 @@ def lift(
     The recording is cut into windows of two seconds that overlap by half. Each has a mixture of
     Gaussian approximations (:mod:`probmotion.lifting.window_fit`) under the prior
     ``cmu-motion``. Means are averaged with weights that fall linearly to 0 at a window's ends; each
-    draw continues from the previous window's. The pitch of an uncalibrated camera and the noise of
-    the keypoints are estimated in three windows.
+    draw continues from the previous window's. The depths of joints and the pitch of an uncalibrated
+    camera are estimated by ``pose-depth`` (:mod:`probmotion.models.unseen_depth.pose_depth`), the
+    noise of the keypoints in three windows.
 
     Draws of an uncalibrated camera have pitches, focal lengths and sizes of their own, drawn
     independently of the path: the paths are approximate, and cameras differ in height.

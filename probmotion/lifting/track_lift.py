@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from probmotion.geometry.rotations import vector_to_matrix
 from probmotion.lifting.camera import LevelCamera
 from probmotion.lifting.checks import MEDIAN, Check, Evidence, checked
 from probmotion.lifting.keypoints import (
+    LIMBS,
     PERSON,
     BodyPath,
     PersonKeypoints,
@@ -21,41 +23,34 @@ from probmotion.lifting.keypoints import (
     smooth_size,
 )
 from probmotion.lifting.window_fit import Observed, lift_window
-from probmotion.lifting.window_posterior import TEMPER, WindowMode, WindowPosterior
+from probmotion.lifting.window_posterior import WindowPosterior
 from probmotion.lifting.window_prior import WindowPrior
 from probmotion.lifting.windows import cut, stitched
+from probmotion.models.unseen_depth.pose_depth import DepthEstimate, PoseDepth
 from probmotion.posteriors.sampling import progress_bar
 from probmotion.threads import one_thread
 
 __all__ = ["TrackLift", "lift_track"]
 
-_SAME = np.radians(3.0)  # largest difference of estimates that are one
-_PITCHES = np.radians([-20.0, 0.0, 20.0])  # first estimates
-_PITCH, _PITCH_SPREAD = np.radians([-5.0, 12.0])  # of cameras: mean and standard deviation
-_PITCH_ERROR = np.radians(3.0)  # standard deviation about the probable values
+_PITCH_ERROR = np.radians(3.5)  # standard deviation of the estimated pitch
+_DEPENDENT = 2.0  # factor of the estimated depths' standard deviations: frames' errors are alike
 _CANDIDATES = 5  # of a window whose noise and score are estimated
-_TILT = 0.15  # standard deviation of the pitch about these, radians
-_TRIED = 3  # windows on which camera and noise are estimated
+_TRIED = 3  # windows on which the noise is estimated
 _FITTED = 0.8  # share of the residuals that the fit leaves
 
 
 class _Windows(NamedTuple):
-    """Averaged keypoints and the windows into which they are cut."""
+    """Averaged keypoints with their estimated depths, and the windows into which they are cut."""
 
     keypoints: PersonKeypoints
     path: BodyPath
+    depths: DepthEstimate
     prior: WindowPrior
     starts: list[int]
     step: int
 
     def posterior(
-        self,
-        start: int,
-        camera: LevelCamera,
-        noise: float,
-        *,
-        candidates: int = 3,
-        tilt: float = 0.0,
+        self, start: int, camera: LevelCamera, noise: float, *, candidates: int = 3
     ) -> WindowPosterior:
         """Return the posterior of the window from a frame on."""
         rows = slice(start, start + self.prior.frames)
@@ -63,17 +58,19 @@ class _Windows(NamedTuple):
         seen = np.where(weight[..., None] > 0, camera.normalised(points), 0.0)
         depth = camera.focal / smooth_size(self.path.size[rows])
         middle = camera.normalised(self.path.middle[rows])
-        observed = Observed(seen, weight, noise)
-        return lift_window(
-            self.prior, camera, observed, middle, depth, candidates=candidates, tilt=tilt
-        )
+        # The prior knows better where joints are that are not seen.
+        shown = weight[:, LIMBS] > 0
+        spread = np.where(shown, _DEPENDENT * self.depths.spread[rows], np.inf)
+        observed = Observed(seen, weight, noise, self.depths.depth[rows], spread)
+        return lift_window(self.prior, camera, observed, middle, depth, candidates=candidates)
 
     def mirrored(self) -> _Windows:
         """Return the windows with left and right exchanged."""
         order = list(PERSON.mirrored_order)
         points, weight, swapped = self.keypoints
         exchanged = PersonKeypoints(points[:, order], weight[:, order], swapped)
-        return self._replace(keypoints=exchanged)
+        depths = _depths(exchanged, self.path, self.prior.fps)
+        return self._replace(keypoints=exchanged, depths=depths)
 
 
 class TrackLift(NamedTuple):
@@ -104,8 +101,8 @@ def lift_track(
 ) -> TrackLift:
     """Return what one camera tells about a motion.
 
-    The ``pitch``, radians, and the ``noise``, pixels, are estimated if they are None, the noise
-    from a first ``guess``.
+    The ``pitch``, radians, and the ``noise``, pixels, are estimated if they are None: the pitch by
+    the regression of depths, the noise from a first ``guess``.
     """
     windows = _windows(keypoints, fps)
     with one_thread(), progress_bar(len(windows.starts), "lift", progress) as bar:
@@ -128,7 +125,7 @@ def lift_track(
     mirrored = other.score - estimate.score
     evidence = Evidence(keypoints, fps, found, level, mean, summaries, mirrored)
     if pitch is None:
-        _tilt(chains, estimate, seed)
+        _tilt(chains, seed)
     return TrackLift(mean, chains, floor, found, level, checked(evidence))
 
 
@@ -136,87 +133,56 @@ def _windows(keypoints: PersonKeypoints, fps: float) -> _Windows:
     """Cut keypoints into windows."""
     prior, starts, step = cut(len(keypoints.points), fps, 1)
     coarse = averaged(keypoints, step)
-    return _Windows(coarse, body_path(coarse), prior, starts, step)
+    path = body_path(coarse)
+    return _Windows(coarse, path, _depths(coarse, path, prior.fps), prior, starts, step)
+
+
+@cache
+def _regression() -> PoseDepth:
+    """Return the shipped regression of depths; cached per process."""
+    return PoseDepth.load()
+
+
+def _depths(keypoints: PersonKeypoints, path: BodyPath, fps: float) -> DepthEstimate:
+    """Return the estimated depths of the joints of arms and legs, and the pitch."""
+    points, visible = keypoints.points[:, LIMBS], keypoints.weight[:, LIMBS] > 0
+    return _regression().estimate(points, visible, path.middle, path.size, fps)
 
 
 class _Estimate(NamedTuple):
-    """Score, noise, and the pitch's probable values, radians, with their probabilities."""
+    """Mean score of windows, noise (pixels) and pitch (radians)."""
 
     score: float
     noise: float
-    pitches: np.ndarray
-    probabilities: np.ndarray
-
-    @property
-    def pitch(self) -> float:
-        """Mean of the pitch, radians."""
-        return float(self.probabilities @ self.pitches)
+    pitch: float
 
 
 def _estimated(
     windows: _Windows, camera: LevelCamera, noise: float, pitch: float | None
 ) -> _Estimate:
-    """Return the score, pitch and noise of some windows.
-
-    With an unknown pitch, modes are found about several first estimates, and each is as probable as
-    its windows' tempered scores and a prior of the pitch say.
-    """
+    """Return the score and noise of some windows, at the estimated pitch if it is None."""
     weight, length = windows.keypoints.weight, windows.prior.frames
     seen = [weight[start : start + length].sum() for start in windows.starts]
     order = np.argsort(seen)[::-1]
     chosen = [windows.starts[i] for i in np.sort(order[: max(_TRIED, len(order) // 2)])]
     chosen = [chosen[i] for i in np.linspace(0, len(chosen) - 1, _TRIED).round().astype(int)]
-    chosen = sorted(set(chosen))
-
-    def found(pitch: float, tilt: float, candidates: int) -> list[WindowMode]:
-        tilted = replace(camera, pitch=pitch)
-        return [
-            windows.posterior(start, tilted, noise, candidates=candidates, tilt=tilt).best
-            for start in chosen
-        ]
-
-    pitches, logs = np.array([pitch]), np.zeros(1)
-    if pitch is None:
-        tried = [found(first, _TILT, 2) for first in _PITCHES.tolist()]
-        pitches = np.array([np.median([mode.pitch for mode in modes]) for modes in tried])
-        scores = np.array([sum(mode.score for mode in modes) for modes in tried])
-        logs = TEMPER * scores + _log_pitch(pitches)
-        kept = _distinct(pitches, logs)
-        pitches, logs = pitches[kept], logs[kept]
-    probabilities = np.exp(logs - logs.max())
-    probabilities /= probabilities.sum()
-    estimate = probabilities @ pitches
-    modes = found(float(estimate), 0.0, _CANDIDATES)
+    pitch = windows.depths.pitch if pitch is None else pitch
+    tilted = replace(camera, pitch=pitch)
+    modes = [
+        windows.posterior(start, tilted, noise, candidates=_CANDIDATES).best
+        for start in sorted(set(chosen))
+    ]
     squares = np.concatenate([mode.standardised[mode.standardised > 0] for mode in modes])
     noise = float(noise * np.sqrt(np.median(squares) / (MEDIAN * _FITTED)))
-    score = sum(mode.score for mode in modes) + float(_log_pitch(estimate)) / TEMPER
-    return _Estimate(score / len(chosen), noise, pitches, probabilities)
+    return _Estimate(float(np.mean([mode.score for mode in modes])), noise, pitch)
 
 
-def _distinct(pitches: np.ndarray, logs: np.ndarray) -> list[int]:
-    """Return the indices of pitches that differ, the most probable of those that do not."""
-    kept: list[int] = []
-    for index in np.argsort(-logs).tolist():
-        if (np.abs(pitches[kept] - pitches[index]) > _SAME).all():
-            kept.append(index)
-    return kept
-
-
-def _log_pitch(pitch: np.ndarray) -> np.ndarray:
-    """Return the log density of the camera's pitch up to a constant."""
-    density: np.ndarray = -0.5 * ((pitch - _PITCH) / _PITCH_SPREAD) ** 2
-    return density
-
-
-def _tilt(draws: np.ndarray, estimate: _Estimate, seed: int) -> None:
+def _tilt(draws: np.ndarray, seed: int) -> None:
     """Turn the draws about the camera, each to a pitch of its own.
 
     The pelvis keeps its height, as the floor is level.
     """
-    rng = seeds.generator(seed, "lift: pitch")
-    count = len(draws)
-    chosen = rng.choice(len(estimate.pitches), count, p=estimate.probabilities)
-    turn = estimate.pitches[chosen] - estimate.pitch + _PITCH_ERROR * rng.standard_normal(count)
+    turn = _PITCH_ERROR * seeds.generator(seed, "lift: pitch").standard_normal(len(draws))
     matrices = vector_to_matrix(turn[:, None] * [1.0, 0.0, 0.0])
     for draw, matrix in zip(draws, matrices, strict=True):
         height = draw[:, :1, 1].copy()

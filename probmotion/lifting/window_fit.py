@@ -3,7 +3,9 @@
 The prior is a mixture of Gaussians, the camera a pinhole camera, and the noise Student-t. For each
 probable component and heading, the projection is linearised at the current mean (Gauss-Newton) and
 outliers have smaller weights, the expected precisions of the scale mixture. Bones have constant
-lengths: |X_j − X_parent| = l_j (1 + δ_j) ± 1 cm with one unknown δ_j for the window.
+lengths: |X_j − X_parent| = l_j (1 + δ_j) ± 1 cm with one unknown δ_j for the window. With one
+camera, depths of joints that a regression estimates
+(:mod:`~probmotion.models.unseen_depth.pose_depth`) are further observations.
 
 Distances to the camera are hardly observed, and the density of all coefficients is largest at a
 motion that is too close and too small: closer motions need smaller deviations from the mean. The
@@ -15,13 +17,15 @@ joint away from the camera.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.ndimage import median_filter
 
 from probmotion.lifting.camera import LevelCamera, LevelCameras
+from probmotion.lifting.keypoints import HIPS, LIMBS
 from probmotion.lifting.window_posterior import (
     FLOOR_SPREAD,
     TEMPER,
@@ -58,11 +62,16 @@ class Observed:
         Multiplier of the precision; 0 where missing.
     noise : float
         Scale of the noise of a keypoint of weight 1, pixels.
+    depth, depth_sd : ndarray, (L, 12), optional
+        Estimated depths of the joints of arms and legs behind the middle of the hips along the
+        optical axis, and the standard deviations of their errors, metres; infinite where unknown.
     """
 
     points: np.ndarray
     weight: np.ndarray
     noise: float
+    depth: np.ndarray | None = None
+    depth_sd: np.ndarray | None = None
 
 
 def lift_window(
@@ -73,7 +82,6 @@ def lift_window(
     depth: np.ndarray,
     *,
     candidates: int = 3,
-    tilt: float = 0.0,
 ) -> WindowPosterior:
     """Return the posterior of a window.
 
@@ -88,12 +96,10 @@ def lift_window(
         First estimate of the body's distance, metres.
     candidates : int
         Number of components and headings that are refined.
-    tilt : float
-        Standard deviation of the camera's pitch about the given one, radians; 0 if it is known.
     """
     factor, chosen = _screened(prior, camera, seen, middle, depth, candidates)
     path = camera.points(middle, factor * depth)
-    return _posterior(prior, camera, seen, path, chosen, tilt)
+    return _posterior(prior, camera, seen, path, chosen)
 
 
 def lift_window_views(
@@ -130,7 +136,7 @@ def lift_window_views(
             scores.append(np.roll(values, -round(turn / (2 * np.pi / A)), axis=1))
     # The mean: errors of the views due to what the screening neglects are not independent.
     chosen = _distinct(np.mean(scores, axis=0), candidates) if scores else _usual(prior, candidates)
-    return _posterior(prior, cameras, seen, path, chosen, 0.0)
+    return _posterior(prior, cameras, seen, path, chosen)
 
 
 def _posterior(
@@ -139,11 +145,10 @@ def _posterior(
     seen: Observed,
     path: np.ndarray,
     chosen: list[tuple[int, int]],
-    tilt: float,
 ) -> WindowPosterior:
     """Return the posterior with the modes of chosen components and headings."""
     origin = _below(path)
-    modes = [_refined(prior, camera, seen, path, origin, k, yaw, tilt) for k, yaw in chosen]
+    modes = [_refined(prior, camera, seen, path, origin, k, yaw) for k, yaw in chosen]
     best = max(mode.score for mode in modes)
     kept = [mode for mode in modes if TEMPER * (mode.score - best) > np.log(_SMALL)]
     return WindowPosterior(prior, origin, tuple(kept))
@@ -222,7 +227,6 @@ def _refined(
     origin: np.ndarray,
     k: int,
     yaw: int,
-    tilt: float,
 ) -> WindowMode:
     """Return the mode of one component and heading."""
     mean = prior.component(k).mean @ rotation(prior.yaws[yaw]).T
@@ -231,48 +235,68 @@ def _refined(
     outliers, force = np.full(seen.weight.shape, _WIDE**-2), np.zeros(at.shape)
     scales = [1.0]
     visible = seen.weight > 0
-    pitch = 0.0  # deviation from the given one over its spread
-    given = camera.pitch if isinstance(camera, LevelCamera) else 0.0
-    mode, leverage = None, None
+    best: _Solution | None = None
     for number in range(_ROUNDS):
         matrix, target = camera.linearised(at, seen.points)
-        target = target - matrix @ origin
-        # Positions relative to a camera of greater pitch are turned about its right.
-        turn = tilt * (matrix[..., 1] * at[..., 2:] - matrix[..., 2] * at[..., 1:2])
-        target = target + pitch * turn
         weight = seen.weight * outliers * (camera.focal / (seen.noise * camera.depth(at))) ** 2
+        keypoints = _Linear(matrix, target - matrix @ origin, weight)
         best = None
         for scale in prior.scales.tolist() if number == 1 else scales:
-            tried, share = _solved(prior, k, yaw, scale, matrix, target, weight, pose, force, turn)
-            positions = tried.positions + origin
-            turned = _turned(camera, given + tilt * tried.pitch)
-            square = seen.weight * _squares(turned, seen, positions)
+            gaussian = WindowGaussian(prior, k, yaw, scale)
+            depths = _depth_rows(gaussian, camera, seen)
+            tried = _solved(prior, gaussian, keypoints, depths, pose, force)
+            positions = gaussian.positions(prior, k, tried.mean[None], np.arange(len(at)))[0]
+            positions = positions + origin
+            square = seen.weight * _squares(camera, seen, positions)
             fit = -0.5 * (_FREEDOM + 2) * np.log1p(square[visible] / _FREEDOM).sum()
-            score = tried.score + fit + prior.log_weights[k]
+            score = float(tried.score + fit + prior.log_weights[k])
             if best is None or score > best.score:
-                best = replace(
-                    tried,
-                    score=score,
-                    positions=positions,
-                    standardised=square,
-                    pitch=given + tilt * tried.pitch,
-                )
-                leverage = share
-        mode = best
-        assert mode is not None
-        assert leverage is not None
-        scales, at, pose = [mode.scale], mode.positions, mode.positions
-        camera = _turned(camera, mode.pitch)
-        pitch = (mode.pitch - given) / tilt if tilt else 0.0
-        outliers = (_FREEDOM + 2) / (_FREEDOM + mode.standardised)
-        force = camera.along_depth(leverage / camera.depth(at))
-    assert mode is not None
-    return mode
+                best = tried._replace(score=score)
+                scales, at, pose, standardised = [scale], positions, positions, square
+        assert best is not None
+        outliers = (_FREEDOM + 2) / (_FREEDOM + standardised)
+        force = camera.along_depth(best.leverage / camera.depth(at))
+    assert best is not None
+    part = prior.component(k)
+    mean_posture = np.flatnonzero((part.frequency == 0) & ~part.ground)
+    posture = float(scales[0] * (best.mean[mean_posture] ** 2).mean())
+    return WindowMode(
+        best.score, k, yaw, scales[0], best.mean, best.lower, at, standardised, posture
+    )
 
 
-def _turned(camera: LevelCamera | LevelCameras, pitch: float) -> LevelCamera | LevelCameras:
-    """Return a camera of another pitch; several cameras are calibrated and unchanged."""
-    return replace(camera, pitch=pitch) if isinstance(camera, LevelCamera) else camera
+class _Linear(NamedTuple):
+    """Keypoints A X = t for positions X about the origin, and precisions of the two sides."""
+
+    matrix: np.ndarray
+    target: np.ndarray
+    weight: np.ndarray
+
+
+class _Solution(NamedTuple):
+    """Gaussian posterior of the coefficients, its log mass, and leverages of keypoints."""
+
+    mean: np.ndarray
+    lower: np.ndarray
+    score: float
+    leverage: np.ndarray
+
+
+def _depth_rows(
+    gaussian: WindowGaussian, camera: LevelCamera | LevelCameras, seen: Observed
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return design (m, r) and residuals (m,) of estimated depths, in units of their noise."""
+    part, sd = gaussian.part, gaussian.deviation
+    if seen.depth is None or seen.depth_sd is None or not isinstance(camera, LevelCamera):
+        return np.zeros((0, len(sd))), np.zeros(0)
+    forward = camera.axes[2] @ gaussian.rotation
+    basis, mean = (
+        (values[:, LIMBS] - values[:, HIPS].mean(axis=1, keepdims=True))
+        for values in (part.basis, part.mean)
+    )
+    design = (forward @ basis) * sd / seen.depth_sd[..., None]
+    residual = (seen.depth - mean @ forward) / seen.depth_sd
+    return design.reshape(-1, len(sd)), residual.ravel()
 
 
 def _squares(
@@ -287,39 +311,36 @@ def _squares(
 
 def _solved(
     prior: WindowPrior,
-    k: int,
-    yaw: int,
-    scale: float,
-    matrix: np.ndarray,
-    target: np.ndarray,
-    weight: np.ndarray,
+    gaussian: WindowGaussian,
+    keypoints: _Linear,
+    depths: tuple[np.ndarray, np.ndarray],
     pose: np.ndarray,
     force: np.ndarray,
-    turn: np.ndarray,
-) -> tuple[WindowMode, np.ndarray]:
-    """Return the Gaussian posterior of A X = t with given weights, and leverages, as weights."""
-    gaussian = WindowGaussian(prior, k, yaw, scale)
+) -> _Solution:
+    """Return the Gaussian posterior given linear observations, bones about a pose and a force."""
     part, R, sd = gaussian.part, gaussian.rotation, gaussian.deviation
+    matrix, target, weight = keypoints
     L, J = weight.shape[-2:]
     r, bones = len(sd), J - 1
-    q, n = r + 2 + bones, 2 * weight.size
+    q, n = r + 1 + bones, 2 * weight.size
+    m = n + L * bones
     root = np.sqrt(weight)[..., None]
     turned = (matrix * root[..., None]) @ R
-    design, residual = np.zeros((n + L * bones, q)), np.empty(n + L * bones)
+    design, residual = np.zeros((m + len(depths[1]), q)), np.empty(m + len(depths[1]))
     design[:n, :r] = ((turned @ part.basis) * sd).reshape(n, r)
     design[:n, r] = (matrix[..., 1] * root).ravel() * FLOOR_SPREAD
-    design[:n, r + 1] = (turn * root).ravel()
     residual[:n] = (target * root - (turned @ part.mean[..., None])[..., 0]).ravel()
     # Bones, linearised along their current directions.
     along = pose[:, prior.children] - pose[:, prior.parents]
     along = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), _BONE_NOISE) @ R
     spread = part.basis[:, prior.children] - part.basis[:, prior.parents]
     rows = (along[..., None, :] @ spread)[..., 0, :] * sd
-    design[n:, :r] = rows.reshape(L * bones, r) / _BONE_NOISE
+    design[n:m, :r] = rows.reshape(L * bones, r) / _BONE_NOISE
     own = np.arange(L * bones)
-    design[n + own, r + 2 + own % bones] = -np.tile(part.bones, L) * PROPORTIONS / _BONE_NOISE
+    design[n + own, r + 1 + own % bones] = -np.tile(part.bones, L) * PROPORTIONS / _BONE_NOISE
     average = part.mean[:, prior.children] - part.mean[:, prior.parents]
-    residual[n:] = (part.bones - (along * average).sum(axis=-1)).ravel() / _BONE_NOISE
+    residual[n:m] = (part.bones - (along * average).sum(axis=-1)).ravel() / _BONE_NOISE
+    design[m:, :r], residual[m:] = depths
     precision = design.T @ design
     precision[np.arange(q), np.arange(q)] += 1.0
     pull = design.T @ residual
@@ -329,21 +350,6 @@ def _solved(
     z = solve_triangular(lower, solve_triangular(lower, pull, lower=True), lower=True, trans=1)
     half = solve_triangular(lower, design[:n].T, lower=True)
     leverage = np.einsum("qn,qn->n", half, half).reshape(*weight.shape, 2).sum(axis=-1)
-    stretch = residual[n:] - design[n:] @ z
-    score = -0.5 * (z @ z + stretch @ stretch) - np.log(np.diag(lower)).sum()
-    positions = gaussian.positions(prior, k, z[None], np.arange(L))[0]
-    mean_posture = (part.frequency == 0) & ~part.ground
-    posture = float(scale * (z[:r][mean_posture] ** 2).mean())
-    mode = WindowMode(
-        score=float(score),
-        component=k,
-        yaw=yaw,
-        scale=scale,
-        mean=z,
-        lower=lower,
-        positions=positions,
-        standardised=np.empty((0, 0)),
-        pitch=z[r + 1],
-        posture=posture,
-    )
-    return mode, leverage
+    off = residual[n:] - design[n:] @ z
+    score = -0.5 * (z @ z + off @ off) - np.log(np.diag(lower)).sum()
+    return _Solution(z, lower, score, leverage)

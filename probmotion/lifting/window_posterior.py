@@ -17,12 +17,14 @@ __all__ = [
 
 FLOOR_SPREAD = 0.3
 """Standard deviation of the floor's height about the window's origin, metres."""
-TEMPER, _INFLATION = 0.03, 2.0
-"""Power of the modes' probabilities, and factor of standard deviations.
+TEMPER = 0.03
+"""Power of the modes' probabilities.
 
-Chosen on validation clips, since motion unlike the clips makes the exact posterior too narrow.
-The factor is multiplied by the root of a mode's ``posture`` if that is above 1.
+Chosen on validation clips, as is the factor of standard deviations, since motion unlike the clips
+makes the exact posterior too narrow. The factor is multiplied by the root of a mode's ``posture``
+if that is above 1.
 """
+_INFLATION = (1.7, 2.0)  # with one camera and with several
 _JOIN_NOISE = 0.01  # standard deviation with which draws continue earlier ones, metres
 
 
@@ -32,10 +34,10 @@ class WindowMode:
 
     ``score`` is its log posterior mass up to a constant. ``mean``, (q,), and ``lower``, (q, q), are
     the mean and the Cholesky factor of the precision of standardised coefficients: those of the
-    component, then the floor's height and the camera's pitch, then the proportions. ``positions``,
-    (L, J, 3), are those of the mean, metres, and ``standardised``, (L, J) or (V, L, J), squared
-    residuals in units of the noise. ``pitch`` is that of the camera, radians. ``posture`` is the
-    mean square of the standardised coefficients of frequency 0: of the mean posture.
+    component, then the floor's height, then the proportions. ``positions``, (L, J, 3), are those of
+    the mean, metres, and ``standardised``, (L, J) or (V, L, J), squared residuals in units of the
+    noise. ``posture`` is the mean square of the standardised coefficients of frequency 0: of the
+    mean posture.
     """
 
     score: float
@@ -46,13 +48,13 @@ class WindowMode:
     lower: np.ndarray
     positions: np.ndarray
     standardised: np.ndarray
-    pitch: float
     posture: float
 
     @property
     def inflation(self) -> float:
         """Factor of the posterior's standard deviations."""
-        return _INFLATION * max(1.0, self.posture) ** 0.5
+        several = self.standardised.ndim > 2
+        return _INFLATION[several] * max(1.0, self.posture) ** 0.5
 
 
 class WindowGaussian:
@@ -81,7 +83,7 @@ class WindowGaussian:
         J = part.directions.shape[0]
         cosines = prior.cosines(times)[:, part.frequency] * self.deviation
         turned = np.tensordot(self.rotation, part.directions, axes=(1, 1)).swapaxes(0, 1)
-        out = np.zeros((len(times), J, 3, r + 2 + len(prior.children)))
+        out = np.zeros((len(times), J, 3, r + 1 + len(prior.children)))
         out[..., :r] = turned * cosines[:, None, None, :]
         out[:, :, 1, r] = FLOOR_SPREAD
         return out.reshape(len(times) * J * 3, -1)

@@ -93,7 +93,10 @@ KINDS = {
     "checkpoint": (write_checkpoint, read_checkpoint),
     "reference": (OWN["reference"][0], read_reference),
     "decomposition": (OWN["decomposition"][0], lambda f: OWN["decomposition"][1](f)._values),
-    **{name: OWN[name] for name in ("annotations", "annotation prior", "joint limits")},
+    **{
+        name: OWN[name]
+        for name in ("annotations", "annotation prior", "pose depth", "joint limits")
+    },
     "stored problem": OWN["stored problem"],
 }
 

@@ -17,6 +17,7 @@ from probmotion.interaction.annotations.annotations import Annotations
 from probmotion.models.pose_pairs.joint_limits import JointLimits
 from probmotion.models.training.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from probmotion.models.unseen_depth.annotation_prior import AnnotationPrior
+from probmotion.models.unseen_depth.pose_depth import PoseDepth
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.reference import StoredReference
 from probmotion.problems.references.chains import StoredChain
@@ -96,6 +97,11 @@ def write_prior(folder):
     AnnotationPrior(np.array([0.4, 0.6]), means, covariances, 0.03, views).save(folder / "p.npz")
 
 
+def write_depths(folder):
+    layers = [(0.1 * np.ones((o, i)), np.zeros(o)) for i, o in ((324, 4), (4, 4), (4, 26))]
+    PoseDepth(layers, {"command": "x"}).save(folder / "d.npz")
+
+
 def write_checkpoint(folder):
     import torch
 
@@ -167,6 +173,7 @@ OWN = {
     "reference": (write_reference, lambda folder: StoredReference.load(folder / "toy")),
     "annotations": (write_annotations, lambda folder: Annotations.load(folder / "a.npz")),
     "annotation prior": (write_prior, lambda folder: AnnotationPrior.load(folder / "p.npz")),
+    "pose depth": (write_depths, lambda folder: PoseDepth.load(folder / "d.npz")),
     "joint limits": (
         lambda folder: JointLimits.shipped().save(folder / "l.npz"),
         lambda folder: JointLimits.load(folder / "l.npz"),

@@ -27,6 +27,7 @@ from probmotion.lifting.keypoints import (
 from probmotion.lifting.window_fit import PROPORTIONS, Observed, lift_window
 from probmotion.lifting.window_posterior import WindowGaussian
 from probmotion.lifting.windows import cut
+from probmotion.models.unseen_depth.pose_depth import PoseDepth
 
 STYLES = ("walk", "march", "run", *["walk"] * 7)  # of ten windows
 CONVERGED = 12  # rounds of the fit
@@ -49,7 +50,8 @@ def window(number):
     normalised = np.where(weight[..., None] > 0, camera.normalised(points), 0.0)
     path = body_path(keypoints)
     depth = camera.focal / smooth_size(path.size)
-    seen = Observed(normalised, weight, noise=4.0)
+    depths = PoseDepth.load().estimate(points[:, LIMBS], weight[:, LIMBS] > 0, *path, prior.fps)
+    seen = Observed(normalised, weight, 4.0, depths.depth, 2 * depths.spread)
     return prior, camera, seen, camera.normalised(path.middle), depth
 
 
@@ -62,8 +64,10 @@ def log_density(z, design, offset, camera, seen, prior, bones):
     bone = positions[:, prior.children] - positions[:, prior.parents]
     lengths = bones * (1 + PROPORTIONS * z[-len(bones) :])
     stretch = (jnp.linalg.norm(bone, axis=-1) - lengths) / 0.01
+    off = (about_hips(positions) @ camera.axes[2] - seen.depth) / seen.depth_sd
     # Student-t with four degrees of freedom in two dimensions.
-    return -0.5 * z @ z - 3 * jnp.log1p(square / 4).sum() - 0.5 * (stretch**2).sum()
+    gaussian = z @ z + (stretch**2).sum() + (off**2).sum()
+    return -0.5 * gaussian - 3 * jnp.log1p(square / 4).sum()
 
 
 def draws_of_nuts(log_density, mode, number):
@@ -93,7 +97,8 @@ def draws_of_nuts(log_density, mode, number):
 
 def about_hips(positions):
     """Return the limbs' joints relative to the middle of the hips."""
-    return positions[..., LIMBS, :] - positions[..., HIPS, :].mean(axis=-2, keepdims=True)
+    limbs = positions[..., jnp.array(LIMBS), :]
+    return limbs - positions[..., jnp.array(HIPS), :].mean(axis=-2, keepdims=True)
 
 
 def compared(number):

@@ -40,10 +40,10 @@ def test_people_may_be_absent_for_two_windows(video):
     confidence = long.track.confidence.copy()
     confidence[90:180] = 0
     track = replace(long.track, confidence=confidence)
-    result = lift(track, image_size=long.size, progress=False, draws=8)
+    result = lift(track, image_size=long.size, progress=False, draws=20)
     assert np.isfinite(result.draws).all()
     spread = np.linalg.norm(about_hips(result.draws).std(axis=0), axis=-1).mean(axis=1)
-    assert spread[120:150].mean() > 1.5 * spread[30:60].mean()
+    assert spread[120:150].mean() > 1.5 * spread[200:230].mean()
 
 
 def test_eight_frames_are_enough(video):
@@ -71,13 +71,6 @@ def test_a_camera_that_looks_down_is_found():
     result = lift(video.track, image_size=video.size, progress=False, draws=2)
     true = -np.degrees(np.arctan2(1.4, distance))
     assert np.degrees(result.camera.pitch) == pytest.approx(true, abs=6)
-
-
-def test_a_pitch_that_several_starts_reach_counts_once(video, lifted, monkeypatch):
-    starts = np.radians([-20.0, 0.0, 20.0, 20.0, 20.0, 20.0])
-    monkeypatch.setattr("probmotion.lifting.track_lift._PITCHES", starts)
-    again = lift(video.track, image_size=video.size, progress=False, draws=2)
-    assert again.camera.pitch == pytest.approx(lifted.camera.pitch, abs=1e-9)
 
 
 def test_a_given_pitch_is_kept(video, lifted):

@@ -6,8 +6,9 @@ import pytest
 from probmotion.data.synthetic.gaits import make_gait
 from probmotion.geometry.rotations import vector_to_matrix
 from probmotion.lifting.camera import LevelCamera
-from probmotion.lifting.keypoints import PERSON
-from probmotion.lifting.window_fit import Observed, lift_window
+from probmotion.lifting.keypoints import HIPS, LIMBS, PERSON
+from probmotion.lifting.window_fit import Observed, _depth_rows, lift_window
+from probmotion.lifting.window_posterior import WindowGaussian
 
 CAMERA = LevelCamera(900.0, (500.0, 500.0), -0.1)
 
@@ -53,11 +54,52 @@ def test_outliers_do_not_move_the_motion(window_prior):
     assert np.median(np.abs(broken.mean(times) - clean)) < 0.03
 
 
-def test_the_pitch_of_the_camera_is_inferred(window_prior):
-    _, seen = observed(window_prior)
-    wrong = LevelCamera(900.0, (500.0, 500.0), 0.0)
-    posterior = lift(window_prior, wrong, seen, np.full(20, 4.3), tilt=0.15)
-    assert posterior.best.pitch == pytest.approx(CAMERA.pitch, abs=0.04)
+def depths(positions: np.ndarray) -> np.ndarray:
+    """Return depths of arms and legs behind the middle of the hips."""
+    depth = positions @ CAMERA.axes[2]
+    return depth[:, LIMBS] - depth[:, HIPS].mean(axis=1, keepdims=True)
+
+
+def test_estimated_depths_count_by_their_standard_deviations(window_prior):
+    truth, seen = observed(window_prior)
+
+    def error(sd: float, depth: np.ndarray) -> float:
+        known = replace(seen, depth=depth, depth_sd=np.full(depth.shape, sd))
+        posterior = lift(window_prior, CAMERA, known, np.full(20, 4.3))
+        return np.abs(depths(posterior.mean(np.arange(20.0))) - depths(truth)).mean()
+
+    alone = lift(window_prior, CAMERA, seen, np.full(20, 4.3))
+    without = np.abs(depths(alone.mean(np.arange(20.0))) - depths(truth)).mean()
+    assert error(0.01, depths(truth)) < 0.4 * without
+    wrong = depths(truth) + 0.3
+    assert error(1e4, wrong) == pytest.approx(without, rel=1e-3)
+    assert error(0.01, wrong) > 2 * without
+
+
+def test_rows_of_depths_are_those_of_the_motion(window_prior):
+    truth, seen = observed(window_prior)
+    rng = np.random.default_rng(0)
+    shape = (len(truth), len(LIMBS))
+    known = replace(
+        seen,
+        depth=depths(truth) + 0.05 * rng.standard_normal(shape),
+        depth_sd=rng.uniform(0.05, 0.2, shape),
+    )
+    posterior = lift(window_prior, CAMERA, known, np.full(20, 4.3), candidates=1)
+    mode = posterior.best
+    gaussian = WindowGaussian(window_prior, mode.component, mode.yaw, mode.scale)
+    rows, residual = _depth_rows(gaussian, CAMERA, known)
+    r = rows.shape[1]
+    at = np.arange(20.0)
+
+    def off(z: np.ndarray) -> np.ndarray:
+        moved = gaussian.positions(window_prior, mode.component, z[None], at)[0] + posterior.origin
+        return ((known.depth - depths(moved)) / known.depth_sd).ravel()
+
+    assert np.allclose(residual - rows @ mode.mean[:r], off(mode.mean))
+    step = np.zeros(len(mode.mean))
+    step[3] = 1.0
+    assert np.allclose(off(mode.mean) - off(mode.mean + step), rows[:, 3])
 
 
 def test_draws_have_the_moments_of_the_modes(window_prior):

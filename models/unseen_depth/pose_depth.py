@@ -1,0 +1,175 @@
+"""Regression of the depths of joints and the pitch of the camera on keypoints of a few frames.
+
+A picture leaves the depths of joints open. A Gaussian prior of motion knows how they covary with
+the keypoints on average; the regression also knows which keypoints occur with which depths, and
+holds for motion of which the single poses are usual. Its input is relative to the apparent size of
+the body, so that it needs neither focal length nor distance.
+
+A picture and its mirror image, in which left and right are exchanged, have the same depths. The
+estimate is therefore the mean of both.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from probmotion.files import read_arrays, written_whole
+from probmotion.motion.skeleton import Skeleton
+from probmotion.validation import check_shape
+
+__all__ = ["FRAMES", "KEYPOINTS", "RATE", "DepthEstimate", "PoseDepth", "relative_keypoints"]
+
+_PERSON = Skeleton.preset("person14")
+KEYPOINTS = tuple(j for j, name in enumerate(_PERSON.joint_names) if name not in ("neck", "pelvis"))
+"""Joints of ``person14`` that are seen and estimated: those of arms and legs."""
+FRAMES = 9
+"""Frames of an input; the estimate is for the one in the middle."""
+RATE = 15.0
+"""Frames per second of an input."""
+_FAR = 2.0  # largest distance of a keypoint from the middle of the body, metres
+_FORMAT = 1
+_WEIGHTS = Path(__file__).parents[1] / "weights"
+_MIRRORED = [KEYPOINTS.index(_PERSON.mirrored_order[j]) for j in KEYPOINTS]
+
+
+class DepthEstimate(NamedTuple):
+    """Depths of joints behind the middle of the hips, along the optical axis, and the pitch.
+
+    ``depth`` and its standard deviation ``spread`` are (L, J), metres. ``pitch`` is the angle of
+    the optical axis above the horizon, radians: the weighted mean of all frames.
+    """
+
+    depth: np.ndarray
+    spread: np.ndarray
+    pitch: float
+
+
+def relative_keypoints(
+    points: np.ndarray, visible: np.ndarray, middle: np.ndarray, size: np.ndarray
+) -> np.ndarray:
+    """Return the input of the regression for each frame, (L, 3 J).
+
+    Parameters
+    ----------
+    points : ndarray, (L, J, 2)
+        Keypoints, pixels with y down.
+    visible : ndarray of bool, (L, J)
+        Which keypoints are known.
+    middle : ndarray, (L, 2)
+        Middle of the body, pixels.
+    size : ndarray, (L,)
+        Apparent size of the body, pixels per metre.
+
+    Returns
+    -------
+    ndarray
+        Positions about the middle, right and up, metres, 0 where unknown; then which are known.
+    """
+    metres = (points - middle[:, None]) / size[:, None, None] * [1.0, -1.0]
+    metres = np.clip(np.where(visible[..., None], metres, 0.0), -_FAR, _FAR)
+    return np.concatenate([metres.reshape(len(points), -1), visible], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseDepth:
+    """Network of the regression.
+
+    Parameters
+    ----------
+    layers : sequence of (ndarray, ndarray)
+        Weights (out, in) and offsets (out,): a first layer, residual layers and a linear last one,
+        whose outputs are depths and pitch, then the logarithms of their mean absolute errors.
+    card : mapping
+        Notes on the training.
+    """
+
+    layers: Sequence[tuple[np.ndarray, np.ndarray]]
+    card: Mapping[str, Any]
+
+    def estimate(
+        self,
+        points: np.ndarray,
+        visible: np.ndarray,
+        middle: np.ndarray,
+        size: np.ndarray,
+        fps: float,
+    ) -> DepthEstimate:
+        """Return the estimates for L frames; parameters as of :func:`relative_keypoints`."""
+        J = len(KEYPOINTS)
+        check_shape("points", points, ("L", J, 2))
+        frames = relative_keypoints(points, visible, middle, size)
+        offsets = np.round(np.arange(-(FRAMES // 2), FRAMES // 2 + 1) * fps / RATE).astype(int)
+        rows = np.clip(np.arange(len(frames))[:, None] + offsets, 0, len(frames) - 1)
+        straight = self._outputs(frames[rows].reshape(len(rows), -1))
+        mirrored = self._outputs(_exchanged(frames)[rows].reshape(len(rows), -1))
+        order = [*_MIRRORED, J]
+        mean = (straight[:, : J + 1] + mirrored[:, order]) / 2
+        logs = (straight[:, J + 1 :] + mirrored[:, J + 1 :][:, order]) / 2
+        # Errors have about a Laplace distribution.
+        spread = np.sqrt(2.0) * np.exp(logs)
+        pitch = np.average(mean[:, J], weights=spread[:, J] ** -2)
+        return DepthEstimate(mean[:, :J], spread[:, :J], float(pitch))
+
+    def _outputs(self, inputs: np.ndarray) -> np.ndarray:
+        """Return the outputs of the last layer: ``(n, 3 J FRAMES) → (n, 2 (J + 1))``."""
+        (first, offset), *residual, (last, last_offset) = self.layers
+        hidden = np.maximum(inputs @ first.T + offset, 0.0)
+        for matrix, shift in residual:
+            hidden = hidden + np.maximum(hidden @ matrix.T + shift, 0.0)
+        outputs: np.ndarray = hidden @ last.T + last_offset
+        return outputs
+
+    def save(self, path: str | Path) -> None:
+        """Write the network to an ``.npz`` file; weights are rounded to half precision."""
+        header = np.array(json.dumps({"format": _FORMAT, "card": dict(self.card)}))
+        arrays: dict[str, np.ndarray] = {}
+        for number, (matrix, offset) in enumerate(self.layers):
+            arrays |= {f"matrix{number}": matrix, f"offset{number}": offset}
+        halves: dict[str, Any] = {name: array.astype(np.float16) for name, array in arrays.items()}
+        with written_whole(Path(path)) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, header=header, **halves)
+
+    @classmethod
+    def load(cls, source: str | Path = "pose-depth") -> PoseDepth:
+        """Read the shipped network by its name, or a file written by :meth:`save`.
+
+        Raises
+        ------
+        ValueError
+            If the file is not such a network.
+        OSError
+            If it cannot be read.
+        """
+        path = _WEIGHTS / f"{source}.npz" if source == "pose-depth" else Path(source)
+        try:
+            archive = read_arrays(path)
+            header = json.loads(str(archive.pop("header")))
+            if header["format"] != _FORMAT:
+                raise ValueError(f"format {header['format']}")
+            floats = {name: array.astype(np.float64) for name, array in archive.items()}
+            layers = [
+                (floats[f"matrix{number}"], floats[f"offset{number}"])
+                for number in range(len(floats) // 2)
+            ]
+            network = cls(layers, header["card"])
+            outputs = network._outputs(np.zeros((1, 3 * len(KEYPOINTS) * FRAMES)))
+            if outputs.shape != (1, 2 * len(KEYPOINTS) + 2) or not np.isfinite(outputs).all():
+                raise ValueError("other layers")
+        except (KeyError, TypeError, ValueError, IndexError, RecursionError) as error:
+            raise ValueError(
+                f"source must be a file written by PoseDepth.save, got {path.name} ({error})"
+            ) from error
+        return network
+
+
+def _exchanged(frames: np.ndarray) -> np.ndarray:
+    """Return the inputs of the mirrored picture with left and right exchanged, (L, 3 J)."""
+    J = len(KEYPOINTS)
+    points = frames[:, : 2 * J].reshape(-1, J, 2)[:, _MIRRORED] * [-1.0, 1.0]
+    return np.concatenate([points.reshape(len(frames), -1), frames[:, 2 * J :][:, _MIRRORED]], 1)

@@ -1,0 +1,187 @@
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from probmotion.data.synthetic.gaits import make_gait
+from probmotion.data.videos import film
+from probmotion.lifting.keypoints import averaged, body_path, from_hips, person_keypoints
+from probmotion.models.training.settings import TrainingSettings
+from probmotion.models.training.trainer import train
+from probmotion.models.unseen_depth.pose_depth import (
+    FRAMES,
+    KEYPOINTS,
+    RATE,
+    PoseDepth,
+    relative_keypoints,
+)
+from probmotion.models.unseen_depth.pose_depth_training import (
+    DepthExamples,
+    PoseDepthTrainee,
+    regression,
+)
+from probmotion.motion.skeleton import Skeleton
+
+torch = pytest.importorskip("torch")
+
+J = len(KEYPOINTS)
+PERSON = Skeleton.preset("person14")
+MIRRORED = [KEYPOINTS.index(PERSON.mirrored_order[j]) for j in KEYPOINTS]
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+@pytest.fixture
+def network(rng):
+    sizes = [3 * J * FRAMES, 16, 16, 2 * J + 2]
+    return PoseDepth(
+        [
+            (0.1 * rng.normal(size=(o, i)), 0.1 * rng.normal(size=o))
+            for i, o in itertools.pairwise(sizes)
+        ],
+        {},
+    )
+
+
+def keypoints(rng, frames=20):
+    """Return points, visibility, middle and size."""
+    points = rng.uniform(300, 700, (frames, J, 2))
+    return points, rng.random((frames, J)) > 0.2, points.mean(axis=1), rng.uniform(150, 200, frames)
+
+
+def test_mirrored_pictures_have_the_same_depths(network, rng):
+    points, visible, middle, size = keypoints(rng)
+    first = network.estimate(points, visible, middle, size, RATE)
+    flip = np.array([-1.0, 1.0])
+    other = network.estimate(
+        points[:, MIRRORED] * flip, visible[:, MIRRORED], middle * flip, size, RATE
+    )
+    assert np.allclose(other.depth, first.depth[:, MIRRORED])
+    assert np.allclose(other.spread, first.spread[:, MIRRORED])
+    assert other.pitch == pytest.approx(first.pitch)
+    assert np.abs(first.depth - first.depth[:, MIRRORED]).max() > 0.01
+
+
+def test_place_and_size_in_the_picture_and_unknown_points_do_not_matter(network, rng):
+    points, visible, middle, size = keypoints(rng)
+    first = network.estimate(points, visible, middle, size, RATE)
+    moved = np.where(visible[..., None], 3 * points - 100, np.nan)
+    other = network.estimate(moved, visible, 3 * middle - 100, 3 * size, RATE)
+    assert np.allclose(other.depth, first.depth)
+    assert other.pitch == pytest.approx(first.pitch)
+
+
+def test_inputs_span_the_same_time_at_other_rates(network, rng):
+    points, visible, middle, size = keypoints(rng)
+    first = network.estimate(points, visible, middle, size, RATE)
+    twice = network.estimate(
+        *(np.repeat(x, 2, axis=0) for x in (points, visible, middle, size)), 2 * RATE
+    )
+    assert np.allclose(twice.depth[::2], first.depth)
+
+
+def test_trained_weights_give_the_same_network(rng):
+    inputs = rng.normal(size=(30, 3 * J))
+    examples = DepthExamples([inputs], [np.zeros((30, J + 1))])
+    trainee = PoseDepthTrainee(examples, examples, width=16)
+    network = regression(trainee.network.state_dict(), {})
+    rows = rng.normal(size=(5, 3 * J * FRAMES))
+    with torch.no_grad():
+        expected = trainee.network.eval()(torch.as_tensor(rows, dtype=torch.float32)).numpy()
+    assert np.allclose(network._outputs(rows), expected, atol=1e-5)
+
+
+def test_a_file_restores_the_network_in_half_precision(network, rng, tmp_path):
+    network.save(tmp_path / "depth.npz")
+    again = PoseDepth.load(tmp_path / "depth.npz")
+    points, visible, middle, size = keypoints(rng)
+    first, second = (n.estimate(points, visible, middle, size, RATE) for n in (network, again))
+    assert np.allclose(first.depth, second.depth, atol=5e-3)
+    assert np.abs(first.depth - second.depth).max() > 0
+
+
+@pytest.mark.parametrize("change", ["layers", "nan", "text", "missing"])
+def test_other_files_are_refused(network, change, tmp_path):
+    path = tmp_path / "depth.npz"
+    layers = list(network.layers)
+    if change == "layers":
+        layers[1] = (np.zeros((16, 15)), np.zeros(16))
+    if change == "nan":
+        layers[2] = (np.full_like(layers[2][0], np.nan), layers[2][1])
+    replace(network, layers=layers).save(path)
+    if change == "text":
+        path.write_text("depth")
+    if change == "missing":
+        np.savez(path, matrix0=np.zeros((2, 2)))
+    with pytest.raises(ValueError, match=r"PoseDepth\.save"):
+        PoseDepth.load(path)
+
+
+def videos(styles, seeds):
+    return [
+        film(make_gait(style, seed, frames=90), seed, azimuth=seed * 1.3, height=0.8 + seed % 3)
+        for style in styles
+        for seed in seeds
+    ]
+
+
+def example(video):
+    """Return the arguments of the estimate, the true depths and pitch."""
+    seen = averaged(person_keypoints(video.track), 2)
+    joints = list(KEYPOINTS)
+    positions = video.motion.positions.reshape(-1, 2, 14, 3).mean(axis=1)
+    pitch = -float(video.camera.elevation[0])
+    depth = from_hips(positions)[:, joints] @ [0, np.sin(pitch), -np.cos(pitch)]
+    arguments = seen.points[:, joints], seen.weight[:, joints] > 0, *body_path(seen)
+    return arguments, depth, pitch
+
+
+def test_training_learns_depths_of_gaits(tmp_path):
+    parts = []
+    for seeds in (range(1, 9), (11, 12)):
+        rows = [example(video) for video in videos(("walk", "run"), seeds)]
+        targets = [np.column_stack([d, np.full(len(d), p)]) for _, d, p in rows]
+        parts.append(DepthExamples([relative_keypoints(*a) for a, _, _ in rows], targets))
+    trainee = PoseDepthTrainee(*parts, width=64)
+    settings = TrainingSettings(steps=300, batch=64, learning_rate=2e-3, ema=0.98)
+    result = train(trainee, settings, tmp_path, progress=False)
+    average = np.mean(
+        [
+            np.abs(t[:, :J] - np.concatenate(parts[0].targets).mean(axis=0)[:J]).mean()
+            for t in parts[1].targets
+        ]
+    )
+    assert result.saved["validation_loss"] < 0.7 * average
+
+
+def test_the_shipped_network_knows_gaits_that_it_has_not_seen():
+    """Made gaits are no clips of the training."""
+    network, errors, sizes, pitches = PoseDepth.load(), [], [], []
+    for video in videos(("walk", "march"), (1, 2)):
+        arguments, depth, pitch = example(video)
+        estimate = network.estimate(*arguments, RATE)
+        errors.append(np.abs(estimate.depth - depth))
+        sizes.append(np.abs(depth))
+        pitches.append(np.degrees(abs(estimate.pitch - pitch)))
+        assert np.quantile(errors[-1] / estimate.spread, 0.9) < 6
+    assert np.mean(errors) < 0.6 * np.mean(sizes)
+    assert np.median(pitches) < 5
+
+
+def test_what_is_not_seen_is_less_certain():
+    network = PoseDepth.load()
+    (points, visible, *path), _, _ = example(videos(("walk",), (1,))[0])
+    shown = network.estimate(points, visible, *path, RATE).spread
+    arm = [KEYPOINTS.index(PERSON.joint_names.index(f"left_{name}")) for name in ("elbow", "wrist")]
+    hidden = visible.copy()
+    hidden[:, arm] = False
+    assert (
+        network.estimate(points, hidden, *path, RATE).spread[:, arm].mean()
+        > 1.2 * shown[:, arm].mean()
+    )
+    nothing = network.estimate(points, np.zeros_like(visible), *path, RATE).spread
+    assert nothing.mean() > 3 * shown.mean()
