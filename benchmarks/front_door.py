@@ -102,8 +102,9 @@ def _moments(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
 
 
 def measure_demo() -> None:
-    """Print the figures of the demonstration."""
-    rule = re.search(r"^demo:.*\n\t@\$\(BIN\)/probmotion (.*)$", MAKEFILE.read_text(), re.MULTILINE)
+    """Print the figures of the demonstration's comparison."""
+    text = MAKEFILE.read_text().replace("\\\n", " ")
+    rule = re.search(r"^demo:.*\n\t@\$\(BIN\)/probmotion (.*)$", text, re.MULTILINE)
     assert rule is not None
     code = "from probmotion.cli.main import main; import sys; sys.exit(main(sys.argv[1:]))"
     command = [sys.executable, "-c", code, *shlex.split(rule[1])]
