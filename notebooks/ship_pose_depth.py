@@ -51,8 +51,9 @@ frames at 15 per second, for `probmotion lift` with one camera ({parameters:.1f}
 - **Data**: made videos (`probmotion.data.videos.film`) of the clips from which `cmu-motion` was
   fitted, {minutes:.1f} minutes, and of their mirror images: {videos} videos of up to five seconds, from
   all sides, with cameras from 0.3 to 4 m high that look at the middle of the path, and with a detector's
-  noise, outliers, gaps and exchanged sides; in a third of the inputs, joints are hidden for some time. Validation
-  and test clips of the denoising study are held out, and the action soccer as a whole.
+  noise, outliers, gaps and exchanged sides; in three of ten inputs, joints
+  are occluded for some time. Validation and test clips of the denoising study are held out, and the action soccer
+  as a whole.
 - **Provenance**: as `cmu-motion.md`.
 - **Not for**: bodies that are not people's, rolled cameras, and postures unlike the clips', such
   as lying and getting up, without wide intervals.
@@ -165,7 +166,7 @@ def errors(network: PoseDepth, clips: Sequence[Motion]) -> tuple[float, float]:
             path = body_path(keypoints)
             estimate = network.estimate(keypoints.points[:, joints], visible, *path, RATE)
             depths.append(np.abs(estimate.depth - example(video)[1][:, :-1]).mean())
-            pitches.append(abs(estimate.pitch - pitch_of(video)))
+            pitches.append(abs(estimate.pitch.mean() - pitch_of(video)))
     return float(np.mean(depths)), float(np.mean(pitches))
 
 

@@ -1,4 +1,4 @@
-"""What keypoints do not show: priors learnt from 2D alone, and a regression of depths."""
+"""Depths that keypoints do not show: priors learnt from 2D alone, and a regression."""
 
 import lazy_loader
 

@@ -1,11 +1,10 @@
 """Regression of the depths of joints and the pitch of the camera on keypoints of a few frames.
 
-A picture leaves the depths of joints open. A Gaussian prior of motion knows how they covary with
-the keypoints on average; the regression also knows which keypoints occur with which depths, and
-holds for motion of which the single poses are usual. Its input is relative to the apparent size of
-the body, so that it needs neither focal length nor distance.
+One view does not determine the depths of joints. The prior of a motion models only their linear
+covariance with the keypoints; the regression is nonlinear. Its input is relative to the apparent
+size of the body, so that it requires neither focal length nor distance.
 
-A picture and its mirror image, in which left and right are exchanged, have the same depths. The
+An image and its mirror image, in which left and right are exchanged, have the same depths. The
 estimate is therefore the mean of both.
 """
 
@@ -14,6 +13,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,15 +39,17 @@ _MIRRORED = [KEYPOINTS.index(_PERSON.mirrored_order[j]) for j in KEYPOINTS]
 
 
 class DepthEstimate(NamedTuple):
-    """Depths of joints behind the middle of the hips, along the optical axis, and the pitch.
+    """Depths of joints behind the middle of the hips along the ray to the body, and its pitch.
 
     ``depth`` and its standard deviation ``spread`` are (L, J), metres. ``pitch`` is the angle of
-    the optical axis above the horizon, radians: the weighted mean of all frames.
+    the ray above the horizon, ``pitch_spread`` its standard deviation, (L,), radians. The cameras
+    of the training look at the middle of the path, so that optical axis and ray were the same.
     """
 
     depth: np.ndarray
     spread: np.ndarray
-    pitch: float
+    pitch: np.ndarray
+    pitch_spread: np.ndarray
 
 
 def relative_keypoints(
@@ -113,8 +115,7 @@ class PoseDepth:
         logs = (straight[:, J + 1 :] + mirrored[:, J + 1 :][:, order]) / 2
         # Errors have about a Laplace distribution.
         spread = np.sqrt(2.0) * np.exp(logs)
-        pitch = np.average(mean[:, J], weights=spread[:, J] ** -2)
-        return DepthEstimate(mean[:, :J], spread[:, :J], float(pitch))
+        return DepthEstimate(mean[:, :J], spread[:, :J], mean[:, J], spread[:, J])
 
     def _outputs(self, inputs: np.ndarray) -> np.ndarray:
         """Return the outputs of the last layer: ``(n, 3 J FRAMES) → (n, 2 (J + 1))``."""
@@ -152,24 +153,32 @@ class PoseDepth:
             header = json.loads(str(archive.pop("header")))
             if header["format"] != _FORMAT:
                 raise ValueError(f"format {header['format']}")
-            floats = {name: array.astype(np.float64) for name, array in archive.items()}
+            floats = {
+                name: array.astype(np.float64, casting="safe") for name, array in archive.items()
+            }
             layers = [
                 (floats[f"matrix{number}"], floats[f"offset{number}"])
                 for number in range(len(floats) // 2)
             ]
-            network = cls(layers, header["card"])
-            outputs = network._outputs(np.zeros((1, 3 * len(KEYPOINTS) * FRAMES)))
-            if outputs.shape != (1, 2 * len(KEYPOINTS) + 2) or not np.isfinite(outputs).all():
+            sizes = [3 * len(KEYPOINTS) * FRAMES, *(len(offset) for _, offset in layers)]
+            hidden, fits = sizes[1:-1], sizes[-1] == 2 * len(KEYPOINTS) + 2
+            shapes = list(pairwise(sizes))
+            fits &= len(set(hidden)) == 1 and len(floats) == 2 * len(layers)
+            for (matrix, offset), (inputs, outputs) in zip(layers, shapes, strict=True):
+                fits &= matrix.shape == (outputs, inputs) and offset.shape == (outputs,)
+            if not fits or not all(np.isfinite(array).all() for array in floats.values()):
                 raise ValueError("other layers")
+            if not isinstance(header["card"], dict):
+                raise TypeError("card")
         except (KeyError, TypeError, ValueError, IndexError, RecursionError) as error:
             raise ValueError(
                 f"source must be a file written by PoseDepth.save, got {path.name} ({error})"
             ) from error
-        return network
+        return cls(layers, header["card"])
 
 
 def _exchanged(frames: np.ndarray) -> np.ndarray:
-    """Return the inputs of the mirrored picture with left and right exchanged, (L, 3 J)."""
+    """Return the inputs of the mirrored image with left and right exchanged, (L, 3 J)."""
     J = len(KEYPOINTS)
     points = frames[:, : 2 * J].reshape(-1, J, 2)[:, _MIRRORED] * [-1.0, 1.0]
     return np.concatenate([points.reshape(len(frames), -1), frames[:, 2 * J :][:, _MIRRORED]], 1)

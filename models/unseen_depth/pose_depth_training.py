@@ -15,12 +15,12 @@ __all__ = ["DepthExamples", "PoseDepthTrainee", "regression"]
 
 _LAYERS, _DROPOUT = 2, 0.1
 _SPREAD = 0.01  # weight of the errors' spread in the loss: it must not cost accuracy
-_HIDDEN = 0.3  # share of inputs of which joints are hidden for some time
+_OCCLUDED = 0.3  # share of inputs of which joints are occluded for some time
 _VALIDATED = 4096  # examples per batch of the validation
 
 
 class DepthExamples(NamedTuple):
-    """Keypoints of V videos at ``RATE`` and what they do not show.
+    """Keypoints of V videos at ``RATE``, with depths and pitches.
 
     ``inputs``: :func:`~probmotion.models.unseen_depth.pose_depth.relative_keypoints` of each video,
     (L, 3 J). ``targets``: depths of the joints behind the middle of the hips, metres, and the
@@ -36,7 +36,7 @@ class PoseDepthTrainee:
 
     The loss is the mean absolute error, plus a small multiple of the negative log likelihood of the
     errors under Laplace distributions, of which only their scales are learnt. In a share of the
-    inputs, some joints are hidden for some time: the scales of what is not seen must be larger.
+    inputs, some joints are occluded for some time: the scales of their errors are larger.
 
     Parameters
     ----------
@@ -96,13 +96,13 @@ class PoseDepthTrainee:
 
 
 def _occluded(inputs: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return inputs (n, FRAMES, 3 J) of which a share has joints that are hidden for some time."""
+    """Return inputs (n, FRAMES, 3 J), a share of them with joints occluded for some time."""
     n, J = len(inputs), len(KEYPOINTS)
     ends = np.sort(rng.integers(FRAMES + 1, size=(n, 2)), axis=1)
     frames = np.arange(FRAMES)
     during = (frames >= ends[:, :1]) & (frames < ends[:, 1:])
     joints = rng.random((n, J)) < rng.random((n, 1))  # from few to all
-    some = rng.random((n, 1, 1)) < _HIDDEN
+    some = rng.random((n, 1, 1)) < _OCCLUDED
     shown = ~(some & during[:, :, None] & joints[:, None])
     return inputs * np.concatenate([np.repeat(shown, 2, axis=2), shown], axis=2)
 

@@ -22,7 +22,7 @@ from probmotion.lifting.keypoints import (
     body_path,
     smooth_size,
 )
-from probmotion.lifting.window_fit import Observed, lift_window
+from probmotion.lifting.window_fit import EstimatedDepths, Observed, lift_window
 from probmotion.lifting.window_posterior import WindowPosterior
 from probmotion.lifting.window_prior import WindowPrior
 from probmotion.lifting.windows import cut, stitched
@@ -32,7 +32,7 @@ from probmotion.threads import one_thread
 
 __all__ = ["TrackLift", "lift_track"]
 
-_PITCH_ERROR = np.radians(3.5)  # standard deviation of the estimated pitch
+_PITCH_ERROR = np.radians(3.5)  # standard deviation of draws' pitches about the estimate
 _DEPENDENT = 2.0  # factor of the estimated depths' standard deviations: frames' errors are alike
 _CANDIDATES = 5  # of a window whose noise and score are estimated
 _TRIED = 3  # windows on which the noise is estimated
@@ -58,10 +58,13 @@ class _Windows(NamedTuple):
         seen = np.where(weight[..., None] > 0, camera.normalised(points), 0.0)
         depth = camera.focal / smooth_size(self.path.size[rows])
         middle = camera.normalised(self.path.middle[rows])
-        # The prior knows better where joints are that are not seen.
+        # Where a joint is not seen, its depth would be an estimate from the prior's clips alone.
         shown = weight[:, LIMBS] > 0
         spread = np.where(shown, _DEPENDENT * self.depths.spread[rows], np.inf)
-        observed = Observed(seen, weight, noise, self.depths.depth[rows], spread)
+        rays = camera.points(middle, np.ones(len(middle))) - camera.position
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        depths = EstimatedDepths(self.depths.depth[rows], spread, rays)
+        observed = Observed(seen, weight, noise, depths)
         return lift_window(self.prior, camera, observed, middle, depth, candidates=candidates)
 
     def mirrored(self) -> _Windows:
@@ -104,7 +107,8 @@ def lift_track(
     The ``pitch``, radians, and the ``noise``, pixels, are estimated if they are None: the pitch by
     the regression of depths, the noise from a first ``guess``.
     """
-    windows = _windows(keypoints, fps)
+    with one_thread():
+        windows = _windows(keypoints, fps)
     with one_thread(), progress_bar(len(windows.starts), "lift", progress) as bar:
         with ThreadPoolExecutor(2) as pool:
             estimate, other = pool.map(
@@ -144,7 +148,7 @@ def _regression() -> PoseDepth:
 
 
 def _depths(keypoints: PersonKeypoints, path: BodyPath, fps: float) -> DepthEstimate:
-    """Return the estimated depths of the joints of arms and legs, and the pitch."""
+    """Return the estimated depths of the joints of arms and legs, and pitches."""
     points, visible = keypoints.points[:, LIMBS], keypoints.weight[:, LIMBS] > 0
     return _regression().estimate(points, visible, path.middle, path.size, fps)
 
@@ -166,7 +170,7 @@ def _estimated(
     order = np.argsort(seen)[::-1]
     chosen = [windows.starts[i] for i in np.sort(order[: max(_TRIED, len(order) // 2)])]
     chosen = [chosen[i] for i in np.linspace(0, len(chosen) - 1, _TRIED).round().astype(int)]
-    pitch = windows.depths.pitch if pitch is None else pitch
+    pitch = _pitch(windows, camera) if pitch is None else pitch
     tilted = replace(camera, pitch=pitch)
     modes = [
         windows.posterior(start, tilted, noise, candidates=_CANDIDATES).best
@@ -175,6 +179,19 @@ def _estimated(
     squares = np.concatenate([mode.standardised[mode.standardised > 0] for mode in modes])
     noise = float(noise * np.sqrt(np.median(squares) / (MEDIAN * _FITTED)))
     return _Estimate(float(np.mean([mode.score for mode in modes])), noise, pitch)
+
+
+def _pitch(windows: _Windows, camera: LevelCamera) -> float:
+    """Return the pitch of the optical axis, radians, from those of the rays to the body.
+
+    With pitch p, the ray (x, y, 1) to the right, up and forward has the elevation e if
+    y cos p + sin p = sin e √(1 + x² + y²).
+    """
+    x, y = camera.normalised(windows.path.middle).T
+    ray, spread = windows.depths.pitch, windows.depths.pitch_spread
+    sine = np.sin(ray) * np.sqrt((1 + x**2 + y**2) / (1 + y**2))
+    pitches = np.arcsin(np.clip(sine, -1, 1)) - np.arctan(y)
+    return float(np.average(pitches, weights=spread**-2))
 
 
 def _tilt(draws: np.ndarray, seed: int) -> None:

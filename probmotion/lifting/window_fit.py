@@ -36,7 +36,7 @@ from probmotion.lifting.window_posterior import (
 from probmotion.lifting.window_prior import WindowPrior
 from probmotion.models.mixture.conditioning import rotation
 
-__all__ = ["PROPORTIONS", "Observed", "lift_window", "lift_window_views"]
+__all__ = ["PROPORTIONS", "EstimatedDepths", "Observed", "lift_window", "lift_window_views"]
 
 PROPORTIONS = 0.03
 """Relative standard deviation of a bone's length between people."""
@@ -48,6 +48,18 @@ _FACTORS = (0.72, 0.85, 1.0, 1.18, 1.39)  # of the first estimate of the distanc
 _NEAR = 2  # headings of one component that are this close are one candidate
 _WIDE = 3.0  # factor of the noise in the first round
 _SMALL = 1e-4  # probability of modes that are left out
+
+
+class EstimatedDepths(NamedTuple):
+    """Depths of the joints of arms and legs behind the middle of the hips, as a regression says.
+
+    ``values`` and the standard deviations ``sd`` of their errors, infinite where unknown, are
+    (L, 12), metres. ``rays`` are the directions of depth, unit vectors (L, 3).
+    """
+
+    values: np.ndarray
+    sd: np.ndarray
+    rays: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,16 +74,14 @@ class Observed:
         Multiplier of the precision; 0 where missing.
     noise : float
         Scale of the noise of a keypoint of weight 1, pixels.
-    depth, depth_sd : ndarray, (L, 12), optional
-        Estimated depths of the joints of arms and legs behind the middle of the hips along the
-        optical axis, and the standard deviations of their errors, metres; infinite where unknown.
+    depths : EstimatedDepths, optional
+        Of one view.
     """
 
     points: np.ndarray
     weight: np.ndarray
     noise: float
-    depth: np.ndarray | None = None
-    depth_sd: np.ndarray | None = None
+    depths: EstimatedDepths | None = None
 
 
 def lift_window(
@@ -235,6 +245,9 @@ def _refined(
     outliers, force = np.full(seen.weight.shape, _WIDE**-2), np.zeros(at.shape)
     scales = [1.0]
     visible = seen.weight > 0
+    # Densities of depths under different assumptions of sides have different scales.
+    known = np.ones(0) if seen.depths is None else seen.depths.sd[np.isfinite(seen.depths.sd)]
+    scale_of_depths = np.log(known).sum()
     best: _Solution | None = None
     for number in range(_ROUNDS):
         matrix, target = camera.linearised(at, seen.points)
@@ -243,13 +256,13 @@ def _refined(
         best = None
         for scale in prior.scales.tolist() if number == 1 else scales:
             gaussian = WindowGaussian(prior, k, yaw, scale)
-            depths = _depth_rows(gaussian, camera, seen)
+            depths = _depth_rows(gaussian, seen.depths)
             tried = _solved(prior, gaussian, keypoints, depths, pose, force)
             positions = gaussian.positions(prior, k, tried.mean[None], np.arange(len(at)))[0]
             positions = positions + origin
             square = seen.weight * _squares(camera, seen, positions)
             fit = -0.5 * (_FREEDOM + 2) * np.log1p(square[visible] / _FREEDOM).sum()
-            score = float(tried.score + fit + prior.log_weights[k])
+            score = float(tried.score + fit + prior.log_weights[k] - scale_of_depths)
             if best is None or score > best.score:
                 best = tried._replace(score=score)
                 scales, at, pose, standardised = [scale], positions, positions, square
@@ -283,19 +296,19 @@ class _Solution(NamedTuple):
 
 
 def _depth_rows(
-    gaussian: WindowGaussian, camera: LevelCamera | LevelCameras, seen: Observed
+    gaussian: WindowGaussian, depths: EstimatedDepths | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return design (m, r) and residuals (m,) of estimated depths, in units of their noise."""
     part, sd = gaussian.part, gaussian.deviation
-    if seen.depth is None or seen.depth_sd is None or not isinstance(camera, LevelCamera):
+    if depths is None:
         return np.zeros((0, len(sd))), np.zeros(0)
-    forward = camera.axes[2] @ gaussian.rotation
+    rays = (depths.rays @ gaussian.rotation)[:, None]
     basis, mean = (
         (values[:, LIMBS] - values[:, HIPS].mean(axis=1, keepdims=True))
         for values in (part.basis, part.mean)
     )
-    design = (forward @ basis) * sd / seen.depth_sd[..., None]
-    residual = (seen.depth - mean @ forward) / seen.depth_sd
+    design = (rays[:, :, None] @ basis)[:, :, 0] * sd / depths.sd[..., None]
+    residual = (depths.values - (mean * rays).sum(axis=-1)) / depths.sd
     return design.reshape(-1, len(sd)), residual.ravel()
 
 

@@ -24,7 +24,8 @@ from probmotion.lifting.keypoints import (
     person_keypoints,
     smooth_size,
 )
-from probmotion.lifting.window_fit import PROPORTIONS, Observed, lift_window
+from probmotion.lifting.track_lift import _DEPENDENT
+from probmotion.lifting.window_fit import PROPORTIONS, EstimatedDepths, Observed, lift_window
 from probmotion.lifting.window_posterior import WindowGaussian
 from probmotion.lifting.windows import cut
 from probmotion.models.unseen_depth.pose_depth import PoseDepth
@@ -51,7 +52,9 @@ def window(number):
     path = body_path(keypoints)
     depth = camera.focal / smooth_size(path.size)
     depths = PoseDepth.load().estimate(points[:, LIMBS], weight[:, LIMBS] > 0, *path, prior.fps)
-    seen = Observed(normalised, weight, 4.0, depths.depth, 2 * depths.spread)
+    spread = np.where(weight[:, LIMBS] > 0, _DEPENDENT * depths.spread, np.inf)
+    rays = np.repeat(camera.axes[2:], len(points), axis=0)
+    seen = Observed(normalised, weight, 4.0, EstimatedDepths(depths.depth, spread, rays))
     return prior, camera, seen, camera.normalised(path.middle), depth
 
 
@@ -64,7 +67,7 @@ def log_density(z, design, offset, camera, seen, prior, bones):
     bone = positions[:, prior.children] - positions[:, prior.parents]
     lengths = bones * (1 + PROPORTIONS * z[-len(bones) :])
     stretch = (jnp.linalg.norm(bone, axis=-1) - lengths) / 0.01
-    off = (about_hips(positions) @ camera.axes[2] - seen.depth) / seen.depth_sd
+    off = (about_hips(positions) @ camera.axes[2] - seen.depths.values) / seen.depths.sd
     # Student-t with four degrees of freedom in two dimensions.
     gaussian = z @ z + (stretch**2).sum() + (off**2).sum()
     return -0.5 * gaussian - 3 * jnp.log1p(square / 4).sum()

@@ -62,7 +62,7 @@ def test_mirrored_pictures_have_the_same_depths(network, rng):
     )
     assert np.allclose(other.depth, first.depth[:, MIRRORED])
     assert np.allclose(other.spread, first.spread[:, MIRRORED])
-    assert other.pitch == pytest.approx(first.pitch)
+    assert np.allclose(other.pitch, first.pitch)
     assert np.abs(first.depth - first.depth[:, MIRRORED]).max() > 0.01
 
 
@@ -72,7 +72,7 @@ def test_place_and_size_in_the_picture_and_unknown_points_do_not_matter(network,
     moved = np.where(visible[..., None], 3 * points - 100, np.nan)
     other = network.estimate(moved, visible, 3 * middle - 100, 3 * size, RATE)
     assert np.allclose(other.depth, first.depth)
-    assert other.pitch == pytest.approx(first.pitch)
+    assert np.allclose(other.pitch, first.pitch)
 
 
 def test_inputs_span_the_same_time_at_other_rates(network, rng):
@@ -104,15 +104,21 @@ def test_a_file_restores_the_network_in_half_precision(network, rng, tmp_path):
     assert np.abs(first.depth - second.depth).max() > 0
 
 
-@pytest.mark.parametrize("change", ["layers", "nan", "text", "missing"])
+@pytest.mark.parametrize("change", ["layers", "narrow", "nan", "card", "text", "missing"])
 def test_other_files_are_refused(network, change, tmp_path):
     path = tmp_path / "depth.npz"
     layers = list(network.layers)
     if change == "layers":
         layers[1] = (np.zeros((16, 15)), np.zeros(16))
+    if change == "narrow":
+        layers[1] = (np.zeros((1, 16)), np.zeros(1))
     if change == "nan":
         layers[2] = (np.full_like(layers[2][0], np.nan), layers[2][1])
     replace(network, layers=layers).save(path)
+    if change == "card":
+        with np.load(path) as archive:
+            arrays = dict(archive)
+        np.savez(path, **arrays | {"header": np.array('{"format": 1, "card": null}')})
     if change == "text":
         path.write_text("depth")
     if change == "missing":
@@ -166,7 +172,7 @@ def test_the_shipped_network_knows_gaits_that_it_has_not_seen():
         estimate = network.estimate(*arguments, RATE)
         errors.append(np.abs(estimate.depth - depth))
         sizes.append(np.abs(depth))
-        pitches.append(np.degrees(abs(estimate.pitch - pitch)))
+        pitches.append(np.degrees(abs(estimate.pitch.mean() - pitch)))
         assert np.quantile(errors[-1] / estimate.spread, 0.9) < 6
     assert np.mean(errors) < 0.6 * np.mean(sizes)
     assert np.median(pitches) < 5
