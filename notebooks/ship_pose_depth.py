@@ -125,26 +125,25 @@ def examples(clips: Sequence[Motion], views: int = VIEWS) -> DepthExamples:
                 video = film(
                     part, int(rng.integers(2**31)), azimuth=rng.uniform(0, 2 * np.pi), height=height
                 )
-                shown, hidden = example(video)
-                inputs.append(shown)
-                targets.append(hidden)
+                arguments, target = example(video)
+                inputs.append(relative_keypoints(*arguments))
+                targets.append(target)
     return DepthExamples(inputs, targets)
 
 
-def example(video: Video) -> tuple[np.ndarray, np.ndarray]:
-    """Return the inputs and targets of a video."""
+def example(video: Video) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+    """Return the arguments of ``relative_keypoints`` and the targets of a video."""
     step = round(FPS / RATE)
     keypoints = averaged(person_keypoints(video.track), step)
-    middle, size = body_path(keypoints)
     joints = list(KEYPOINTS)
     visible = keypoints.weight[:, joints] > 0
-    inputs = relative_keypoints(keypoints.points[:, joints], visible, middle, size)
-    frames = len(inputs)
+    arguments = keypoints.points[:, joints], visible, *body_path(keypoints)
+    frames = len(visible)
     positions = video.motion.positions[: frames * step]
     mean = from_hips(positions.reshape(frames, step, -1, 3).mean(axis=1))[:, joints]
     pitch = pitch_of(video)
     depth = mean @ [0.0, np.sin(pitch), -np.cos(pitch)]
-    return inputs, np.concatenate([depth, np.full((frames, 1), pitch)], axis=1)
+    return arguments, np.concatenate([depth, np.full((frames, 1), pitch)], axis=1)
 
 
 def pitch_of(video: Video) -> float:
@@ -160,12 +159,9 @@ def errors(network: PoseDepth, clips: Sequence[Motion]) -> tuple[float, float]:
             azimuth = (number + 3 * view) % 8 * np.pi / 4
             part = clip.window(0, min(LENGTH, clip.frames))
             video = film(part, number, azimuth=azimuth, height=height)
-            keypoints = averaged(person_keypoints(video.track), round(FPS / RATE))
-            joints = list(KEYPOINTS)
-            visible = keypoints.weight[:, joints] > 0
-            path = body_path(keypoints)
-            estimate = network.estimate(keypoints.points[:, joints], visible, *path, RATE)
-            depths.append(np.abs(estimate.depth - example(video)[1][:, :-1]).mean())
+            arguments, target = example(video)
+            estimate = network.estimate(*arguments, RATE)
+            depths.append(np.abs(estimate.depth - target[:, :-1]).mean())
             pitches.append(abs(estimate.pitch.mean() - pitch_of(video)))
     return float(np.mean(depths)), float(np.mean(pitches))
 

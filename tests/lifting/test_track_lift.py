@@ -7,6 +7,8 @@ from probmotion.data.synthetic.gaits import make_gait
 from probmotion.data.videos import film, quadruped_as_person
 from probmotion.geometry.rotations import vector_to_matrix
 from probmotion.lifting import lift
+from probmotion.lifting.keypoints import LIMBS, PERSON, person_keypoints
+from probmotion.lifting.track_lift import _windows
 
 SEEN = slice(2, None)  # person14 but for pelvis and neck
 
@@ -48,6 +50,29 @@ def test_people_may_be_absent_for_two_windows(video):
         return np.linalg.norm(about_hips(result.draws[:, 120:150]).std(axis=0), axis=-1).mean()
 
     assert spread(gap) > 1.2 * spread(long.track)
+
+
+def test_depths_of_joints_that_are_not_seen_do_not_count(video, lifted):
+    windows = _windows(person_keypoints(video.track), video.track.fps)
+    unseen = windows.keypoints.weight[:, LIMBS] == 0
+
+    def score(windows):
+        return windows.posterior(0, lifted.camera, 4.0).best.score
+
+    assert unseen.any()
+    wrong = np.where(unseen, 5.0, windows.depths.depth)
+    assert score(windows._replace(depths=windows.depths._replace(depth=wrong))) == score(windows)
+    wrong = np.where(unseen, windows.depths.depth, 5.0)
+    assert score(windows._replace(depths=windows.depths._replace(depth=wrong))) < score(windows)
+
+
+def test_exchanged_sides_have_depths_of_their_own(video):
+    windows = _windows(person_keypoints(video.track), video.track.fps)
+    mirrored = windows.mirrored()
+    order = [LIMBS.index(PERSON.mirrored_order[joint]) for joint in LIMBS]
+    for other in (windows.depths.depth, windows.depths.depth[:, order]):
+        assert np.abs(mirrored.depths.depth - other).mean() > 0.02
+    assert np.array_equal(mirrored.mirrored().depths.depth, windows.depths.depth)
 
 
 def test_eight_frames_are_enough(video):

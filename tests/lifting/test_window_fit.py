@@ -77,6 +77,18 @@ def test_estimated_depths_count_by_their_standard_deviations(window_prior):
     assert error(0.01, wrong) > 2 * without
 
 
+def test_scores_of_windows_are_normalised_over_depths(window_prior):
+    """Depths with other standard deviations can be compared, as those of exchanged sides."""
+    truth, seen = observed(window_prior)
+
+    def score(sd: float) -> float:
+        depth = depths(truth)
+        known = replace(seen, depths=EstimatedDepths(depth, np.full(depth.shape, sd), RAYS))
+        return lift(window_prior, CAMERA, known, np.full(20, 4.3), candidates=1).best.score
+
+    assert score(1e6) - score(1e7) == pytest.approx(20 * len(LIMBS) * np.log(10))
+
+
 def test_rows_of_depths_are_those_of_the_motion(window_prior):
     truth, seen = observed(window_prior)
     rng = np.random.default_rng(0)
