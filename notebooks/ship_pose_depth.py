@@ -162,7 +162,8 @@ def errors(network: PoseDepth, clips: Sequence[Motion]) -> tuple[float, float]:
             arguments, target = example(video)
             estimate = network.estimate(*arguments, RATE)
             depths.append(np.abs(estimate.depth - target[:, :-1]).mean())
-            pitches.append(abs(estimate.pitch.mean() - pitch_of(video)))
+            pitch = np.average(estimate.pitch, weights=estimate.pitch_spread**-2)
+            pitches.append(abs(pitch - pitch_of(video)))
     return float(np.mean(depths)), float(np.mean(pitches))
 
 
