@@ -166,12 +166,20 @@ def open_archive(content: bytes) -> zipfile.ZipFile:
     Raises
     ------
     ValueError
-        If the content is no zip archive, or unpacks to more than 64 MiB and 100 times its size.
+        If the content is no zip archive, lacks members, or unpacks to more than 64 MiB and 100
+        times its size.
     """
     try:
         archive = zipfile.ZipFile(io.BytesIO(content))
     except Exception as error:  # damaged zip files raise many types, including MemoryError
         raise ValueError(f"expected an npz archive ({str(error)[:80]})") from error
+    # zipfile does not compare the number of members with the one at the end of the archive.
+    end = len(content) - len(archive.comment)
+    members = int.from_bytes(content[end - 12 : end - 10], "little")
+    if members != len(archive.infolist()):
+        raise ValueError(
+            f"expected an npz archive of {members} members, got {len(archive.infolist())}"
+        )
     unpacked = sum(member.file_size for member in archive.infolist())
     most = max(_UNPACKED_BYTES, _UNPACKED_RATIO * len(content))
     if unpacked > most:
@@ -228,7 +236,10 @@ def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
         If the file cannot be opened.
     """
     with open_archive(Path(path).read_bytes()) as archive:
-        names = [name for name in archive.namelist() if name.endswith(".npy")]
+        names = archive.namelist()
+        # A damaged name must not hide an array.
+        if other := [name for name in names if not name.endswith(".npy")]:
+            raise ValueError(f"expected an npz archive of arrays alone, got {other[0]!r:.40}")
         return {key: member_array(archive, key) for key in (n.removesuffix(".npy") for n in names)}
 
 

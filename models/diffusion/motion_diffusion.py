@@ -20,7 +20,7 @@ from probmotion.geometry.cameras import Cameras
 from probmotion.models.diffusion.motion_transformer import MotionTransformer
 from probmotion.models.diffusion.settings import DiffusionSettings
 from probmotion.models.training.checkpoints import Checkpoint, load_weights, save_checkpoint
-from probmotion.models.training.devices import batch_tokens
+from probmotion.models.training.devices import batch_tokens, inference
 from probmotion.models.training.standardisation import Standards
 from probmotion.models.training.track_network import TrackNetwork, load_track_checkpoint
 from probmotion.motion.skeleton import Skeleton
@@ -154,7 +154,7 @@ class MotionDiffusion(TrackNetwork):
         network = self._network_at(alpha_bar)
         clean = np.empty_like(x_t)
         for rows, chunk in self._chunks(x_t):
-            with torch.inference_mode():
+            with inference(self._device):
                 denoised = network(chunk)
             clean[rows] = _numbers(denoised, x_t)[: len(clean[rows])]
         return clean

@@ -13,7 +13,7 @@ import numpy as np
 from probmotion.extras import torch
 from probmotion.models.evaluation.track_autoencoder import EvaluatorSettings, TrackEncoder
 from probmotion.models.training.checkpoints import Checkpoint, load_weights, save_checkpoint
-from probmotion.models.training.devices import batch_tokens
+from probmotion.models.training.devices import batch_tokens, inference
 from probmotion.models.training.track_network import TrackNetwork, load_track_checkpoint
 from probmotion.validation import check_finite, check_shape
 
@@ -119,7 +119,7 @@ class TrackEvaluator(TrackNetwork):
             motions[:size, :L] = standardised[chunk].reshape(size, L, -1)
             mask[:size, :L] = valid[chunk]
             inputs = (torch.as_tensor(array, device=self._device) for array in (motions, mask))
-            with torch.inference_mode():
+            with inference(self._device):
                 mean, _ = self._network(*inputs)
             features[chunk] = mean[:size].cpu().numpy()
         return features

@@ -17,7 +17,7 @@ import numpy as np
 from probmotion import seeds
 from probmotion.extras import nn, torch
 from probmotion.models.training.checkpoints import load_checkpoint, load_weights
-from probmotion.models.training.devices import check_device
+from probmotion.models.training.devices import check_device, inference
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_count, check_finite, check_positive, check_shape
 
@@ -234,7 +234,7 @@ class PoseLifter:
             chunk = slice(start, start + n)
             padded = np.zeros((_CHUNK, J, 2), np.float32)
             padded[:n] = poses[chunk]
-            with torch.inference_mode():
+            with inference(self._device):
                 estimate = self._network(torch.from_numpy(padded).to(self._device))
             depth[chunk], elevation[chunk] = (part.cpu().numpy()[:n] for part in estimate)
         return poses, depth, elevation.reshape(views.shape[:2]).mean(axis=1)

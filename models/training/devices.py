@@ -13,7 +13,14 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from probmotion import seeds
 from probmotion.extras import torch
 
-__all__ = ["batch_tokens", "check_device", "dropout_seed", "half_precision", "is_half_precision"]
+__all__ = [
+    "batch_tokens",
+    "check_device",
+    "dropout_seed",
+    "half_precision",
+    "inference",
+    "is_half_precision",
+]
 
 _GPU_TOKENS = 200_000  # of a batch, for 8 GiB at the published size
 
@@ -48,6 +55,21 @@ def is_half_precision(device: torch.device) -> bool:
     """Return whether :func:`half_precision` is enabled."""
     available = torch.amp.is_autocast_available(device.type)
     return available and torch.is_autocast_enabled(device.type)
+
+
+@contextmanager
+def inference(device: str) -> Iterator[None]:
+    """Disable gradients and, on CUDA, torch's fused transformer layers.
+
+    The fused layers round matrix products to TF32, whatever torch's settings: errors of 1e-3.
+    """
+    enabled = torch.backends.mha.get_fastpath_enabled()
+    torch.backends.mha.set_fastpath_enabled(enabled and device == "cpu")
+    try:
+        with torch.inference_mode():
+            yield
+    finally:
+        torch.backends.mha.set_fastpath_enabled(enabled)
 
 
 @contextmanager

@@ -22,7 +22,7 @@ from probmotion.comparison.results.fingerprint import fingerprint
 from probmotion.comparison.results.plan import Plan
 from probmotion.comparison.results.run_results import read_result
 from probmotion.comparison.run.grid_tasks import PilotResult
-from probmotion.files import read_json, write_json
+from probmotion.files import read_arrays, read_json, write_json
 from probmotion.models.mixture import SpectralMixtureMotion
 from probmotion.models.training.checkpoints import load_checkpoint
 from probmotion.posteriors import streams
@@ -206,3 +206,30 @@ def test_files_without_a_checksum_are_read(tmp_path):
     assert read_json(tmp_path / "old.json") == {"a": 1}
     write_json(Path(tmp_path, "new.json"), {"a": 1, 2: [0.1, None]})
     assert read_json(tmp_path / "new.json") == {"a": 1, "2": [0.1, None]}
+
+
+def test_no_flipped_bit_hides_an_array(tmp_path):
+    path = tmp_path / "arrays.npz"
+    np.savez(path, first=np.arange(3), last=np.arange(4.0))
+    content = path.read_bytes()
+    start = content.index(b"PK\x01\x02")  # the directory at the end
+    for bit in range(8 * start, 8 * len(content)):
+        damaged = bytearray(content)
+        damaged[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(damaged)
+        try:
+            arrays = read_arrays(path)
+        except ValueError:
+            continue
+        assert list(arrays) == ["first", "last"]
+
+
+@pytest.mark.parametrize(("name", "value"), [("n", 10**400), ("classifier", [0.5, 0.0])])
+def test_impossible_statistics_are_not_believed(name, value, tmp_path):
+    OWN["comparison"][0](tmp_path)
+    path = tmp_path / "runs/filmed/good/0/run.json"
+    assert read_result(path.parent) is not None
+    stored = read_json(path)
+    stored["statistics"][name] = value
+    write_json(path, stored)
+    assert read_result(path.parent) is None

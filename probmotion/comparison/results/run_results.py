@@ -71,7 +71,9 @@ def read_result(folder: Path) -> RunResult | None:
         if result.statistics is not None:
             _check_statistics(DrawStatistics(**result.statistics))
         return result
-    except (FileNotFoundError, NotADirectoryError, AttributeError, ValueError, KeyError, TypeError):
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except (AttributeError, ValueError, KeyError, TypeError, OverflowError):
         return None
 
 
@@ -83,7 +85,7 @@ def _check_budget(budget: dict[str, Any]) -> None:
 
 
 def _check_statistics(stored: DrawStatistics) -> None:
-    """Raise ``ValueError`` or ``TypeError`` unless stored statistics fit each other."""
+    """Raise an error of arithmetic, types or values unless stored statistics fit each other."""
     k, n_modes = len(stored.mean), len(stored.modes)
     for name, value, shapes in (
         ("n", stored.n, [()]),
@@ -103,6 +105,8 @@ def _check_statistics(stored: DrawStatistics) -> None:
             raise ValueError(f"{name} must have shape {shapes[0]}, got {value!r:.80}")
     if not stored.n > 0:
         raise ValueError(f"n must be above 0, got {stored.n!r:.80}")
+    if stored.classifier and stored.classifier[1] == 0:
+        raise ValueError("classifier must have a standard deviation above 0, got 0")
 
 
 def read_draws(folder: Path) -> MotionDraws:

@@ -194,7 +194,7 @@ def _array(table: dict[str, Any], key: str, shape: tuple[int, ...], where: str) 
     with errors_in(where):
         try:
             values = np.array(table.get(key), dtype=float)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise ValueError(f"{key} must be numbers, got {shortened(table.get(key))}") from None
         check_shape(key, values, shape)
         check_finite(key, values)

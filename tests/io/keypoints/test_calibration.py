@@ -106,6 +106,7 @@ def test_names_of_some_cameras_only_are_refused(path, names, got):
         ("[1680.0, 0.0", "[1680.0, 2.0", "focal lengths and principal point only"),
         ("[0.3, 1.0, 3.0]", "[0.3, 1.0]", "translation must have shape"),
         ("[0.3, 1.0, 3.0]", '["a", 1.0, 3.0]', "translation must be numbers"),
+        ("[0.3, 1.0, 3.0]", f"[{'9' * 400}, 1.0, 3.0]", "translation must be numbers"),
         ("[0.3, 1.0, 3.0]", "[nan, 1.0, 3.0]", "translation must be finite"),
         ("-0.3, 0.1, ", "", "distortions must be 4 or 5"),
         ("1088.0", "0.0", "size must be pixels"),

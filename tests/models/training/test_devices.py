@@ -34,7 +34,12 @@ from probmotion.models.evaluation.lifter_training import LifterTrainee
 from probmotion.models.evaluation.pose_flow import FlowSettings
 from probmotion.models.evaluation.pose_flow_training import PoseFlowTrainee
 from probmotion.models.evaluation.track_autoencoder import EvaluatorSettings
-from probmotion.models.training.devices import check_device, half_precision, is_half_precision
+from probmotion.models.training.devices import (
+    check_device,
+    half_precision,
+    inference,
+    is_half_precision,
+)
 from probmotion.models.training.settings import TrainingSettings
 from probmotion.models.training.trainer import train
 from probmotion.models.vae.settings import MotionVAESettings
@@ -182,6 +187,16 @@ def test_draws_do_not_amplify_rounding(name):
     assert 0 < abs(draws - draws_of(name, prior)).max() < TOLERANCE
 
 
+def test_fused_layers_are_not_used_on_cuda():
+    enabled = torch.backends.mha.get_fastpath_enabled
+    assert enabled()
+    with inference("cpu"):
+        assert enabled()
+    with inference("cuda"):
+        assert not enabled()
+    assert enabled()
+
+
 @pytest.mark.gpu
 @pytest.mark.parametrize("name", SAMPLERS)
 def test_draws_are_those_of_the_cpu(name):
@@ -194,7 +209,8 @@ def test_networks_compute_what_they_compute_on_the_cpu():
     rng = np.random.default_rng(0)
     x_t, vectors = rng.standard_normal((2, 3, 2, 8, walk2d().skeleton.n_joints, 2))
     lifter = LifterNetwork(LifterSettings.tiny(), PERSON.n_joints, 0)
-    views = np.stack([track.keypoints[:8] for track in project_clips(clips(), views=1)])
+    tracks = project_clips(clips(), views=1)
+    views = np.stack([np.nan_to_num(track.keypoints[:8]) for track in tracks])
     results = []
     for device in ("cpu", "cuda"):
         prior = walk2d(device=device)
