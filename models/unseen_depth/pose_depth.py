@@ -41,9 +41,9 @@ _MIRRORED = [KEYPOINTS.index(_PERSON.mirrored_order[j]) for j in KEYPOINTS]
 class DepthEstimate(NamedTuple):
     """Depths of joints behind the middle of the hips along the ray to the body, and its pitch.
 
-    ``depth`` and its standard deviation ``spread`` are (L, J), metres. ``pitch`` is the angle of
-    the ray above the horizon, ``pitch_spread`` its standard deviation, (L,), radians. The cameras
-    of the training look at the middle of the path, so that optical axis and ray were the same.
+    The ray is that to the middle of the body in the image. ``depth`` and its standard deviation
+    ``spread`` are (L, J), metres. ``pitch`` is the angle of the ray above the horizon,
+    ``pitch_spread`` its standard deviation, (L,), radians.
     """
 
     depth: np.ndarray

@@ -23,8 +23,8 @@ class DepthExamples(NamedTuple):
     """Keypoints of V videos at ``RATE``, with depths and pitches.
 
     ``inputs``: :func:`~probmotion.models.unseen_depth.pose_depth.relative_keypoints` of each video,
-    (L, 3 J). ``targets``: depths of the joints behind the middle of the hips, metres, and the
-    camera's pitch, radians, (L, J + 1).
+    (L, 3 J). ``targets``: depths of the joints behind the middle of the hips along the ray to the
+    body, metres, and the pitch of the ray, radians, (L, J + 1).
     """
 
     inputs: Sequence[np.ndarray]
