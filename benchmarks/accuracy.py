@@ -3,6 +3,8 @@
 Prints ``name: value`` lines. ``diffusion``: metrics of 400 draws (split Gibbs: 200, with five 2D
 views), mean over seeds.
 
+``learnt``: see :func:`learnt_figures`.
+
 ``lift``: see ``lift_figures.py``; ``mixing``: see ``mixing_figures.py``.
 
 ``exact-priors``: coverages are mean distances from held-out pose pairs to the nearest lifted
@@ -58,6 +60,7 @@ from probmotion.motion.motion import Motion
 from probmotion.posteriors.likelihoods import Joints3D
 from probmotion.posteriors.sampling import Sampler
 from probmotion.problems.denoising import limb_occlusions
+from probmotion.problems.joint_correction import correct_joints
 from probmotion.samplers import Ancestral3D, MultiViewPredictorCorrector
 from probmotion.samplers.conditional import SplitGibbs
 
@@ -329,6 +332,59 @@ def denoising_figures(folder: Path) -> Figures:
     yield "denoise_coverage_90_lowest", float(np.min(inside))
 
 
+def learnt_figures(folder: Path) -> Figures:
+    """Yield errors of means corrected by ``body-dvae`` over those of the spectral prior alone.
+
+    Same windows as above, one draw of the noise. Regression: the network unchanged, over a Kalman
+    smoother. Acceleration ratio: median over draws, to the truth.
+    """
+    errors: dict[str, list[list[float]]] = {"noise": [], "all": [], "occluded": []}
+    inside: dict[str, list[float]] = {"": [], "_occluded_joints": []}
+    regressions, accelerations, seconds = [], [], []
+    for number, window in enumerate(denoising_windows(folder)):
+        truth, occlusion = window.positions, limb_occlusions(window)
+        for name, hidden in (("noise", np.zeros_like(occlusion)), ("all", occlusion)):
+            seen = Joints3D.observe(window, NOISE, number, hidden=hidden)
+            confidence = seen.entries.confidence
+            smooth, _ = kalman_smooth(seen.joints, confidence, noise=NOISE, fps=window.fps)
+            found = denoise_joints(
+                seen.joints, confidence, skeleton=window.skeleton, fps=window.fps, noise=NOISE,
+                draws=200, progress=False,
+            )  # fmt: skip
+            start = time.perf_counter()
+            corrected = correct_joints(found, fps=window.fps, progress=False)
+            seconds.append((time.perf_counter() - start) / window.frames)
+            regression = correct_joints(found, fps=window.fps, iterations=0, progress=False)
+            own, spectral, unchanged, kalman = (
+                np.linalg.norm(mean - truth, axis=-1)
+                for mean in (corrected.mean, found.mean, regression.mean, smooth)
+            )
+            errors[name].append([own.mean(), spectral.mean()])
+            regressions.append([unchanged.mean(), kalman.mean()])
+            low, high = np.quantile(corrected.draws, [0.05, 0.95], axis=0)
+            covered = (low <= truth) & (truth <= high)
+            inside[""].append(covered.mean())
+            if hidden.any():
+                errors["occluded"].append([own[hidden].mean(), spectral[hidden].mean()])
+                inside["_occluded_joints"].append(covered[hidden].mean())
+            ratios = [_acceleration(draw) / _acceleration(truth) for draw in corrected.draws]
+            accelerations.append(np.median(ratios))
+    for name, pairs in errors.items():
+        own, spectral = np.mean(pairs, axis=0)
+        yield f"dvae_over_spectral_{name}", own / spectral
+    own, kalman = np.mean(regressions, axis=0)
+    yield "dvae_regression_over_kalman", own / kalman
+    for name, shares in inside.items():
+        yield f"dvae_coverage_90{name}", float(np.mean(shares))
+    yield "dvae_acceleration_ratio", float(np.mean(accelerations))
+    yield "dvae_seconds_per_frame", float(np.mean(seconds))
+
+
+def _acceleration(positions: np.ndarray) -> float:
+    """Return the mean size of second differences."""
+    return float(np.linalg.norm(np.diff(positions, n=2, axis=0), axis=-1).mean())
+
+
 def denoising_windows(folder: Path) -> list[Motion]:
     """Return the first and last 60 frames of each test clip, once if they overlap by half."""
     windows = []
@@ -400,10 +456,16 @@ def main() -> None:
         help="Folder of the unsupervised lifter, which is trained there (minutes) if it is absent; "
         "by default, lifts are not compared with it.",
     )
+    command = commands.add_parser("learnt", help="Learnt priors against the spectral prior.")
+    command.add_argument("--data", required=True, help="Folder with the real motions.")
     commands.add_parser("mixing", help="Samplers of many modes within budgets.")
     options = parser.parse_args()
     if options.command == "lift":
         for name, value in lift_figures(Path(options.data), options.lifter):
+            print(f"{name}: {value:.4g}", flush=True)
+        return
+    if options.command == "learnt":
+        for name, value in learnt_figures(Path(options.data)):
             print(f"{name}: {value:.4g}", flush=True)
         return
     if options.command in ("diffusion", "mixing"):

@@ -45,6 +45,9 @@ class Denoise(Conventions):
     outliers: FlagCreatePairsOff[bool] = False
     """Student-t noise with 3 degrees of freedom, for recordings with outliers."""
 
+    correct: FlagCreatePairsOff[bool] = False
+    """Correct the mean with the network body-dvae: smaller errors, .1 s per frame, needs torch."""
+
     draws: int = 20
     """Number of posterior draws."""
 
@@ -83,6 +86,10 @@ class Denoise(Conventions):
             seed=self.seed,
             progress=True,
         )
+        if self.correct:
+            from probmotion.problems.joint_correction import correct_joints
+
+            result = correct_joints(result, fps=track.fps, seed=self.seed)
         _write(track, result, self.out)
         print(_summary(track, result, self.file, self.noise is None))
         print(

@@ -102,6 +102,19 @@ def test_files_and_summary(calls, capsys, tmp_path):
         assert archive["draws"].shape == (20, 20, 14, 3)
 
 
+def test_the_mean_is_corrected_on_request(calls, monkeypatch, tmp_path):
+    record(tmp_path / "walk.npz")
+
+    def correct_joints(found, *, fps, seed):
+        assert (fps, seed) == (60.0, 5)
+        return SimpleNamespace(**(vars(found) | {"mean": found.mean + 1}))
+
+    monkeypatch.setattr("probmotion.problems.joint_correction.correct_joints", correct_joints)
+    words = ["denoise", str(tmp_path / "walk.npz"), "--out", str(tmp_path / "out"), "--seed", "5"]
+    assert main([*words, "--correct"]) == 0
+    np.testing.assert_array_equal(load(tmp_path / "out" / "denoised.npz").positions, WALK + 1)
+
+
 @pytest.mark.parametrize("name", ["h36m17", "coco17"])
 def test_other_skeletons_are_retargeted(name, calls, tmp_path):
     skeleton = Skeleton.preset(name)
