@@ -108,12 +108,15 @@ def load_checkpoint(source: str | Path, kind: str) -> Checkpoint:
 
     path = _find(source, kind)
     try:
-        # With the framework "pt", safetensors would take Ctrl-C for a damaged file.
-        with safe_open(path, framework="numpy") as file:
-            text = (file.metadata() or {}).get(_ENTRY)
-        tensors = load(path.read_bytes())
+        content = path.read_bytes()
+        # safe_open with the framework "pt" would take Ctrl-C for a damaged file.
+        tensors = load(content)
+        size = int.from_bytes(content[:8], "little")
+        text = json.loads(content[8 : 8 + size]).get("__metadata__", {}).get(_ENTRY)
         header = None if text is None else json.loads(text)
-    except (SafetensorError, ValueError, KeyError, RecursionError, OSError) as error:
+    except (
+        SafetensorError, ValueError, KeyError, TypeError, RuntimeError, RecursionError, OSError,
+    ) as error:  # fmt: skip
         raise CheckpointError(f"{path} is damaged or not a safetensors file: {error}") from error
     if not isinstance(header, dict) or "format" not in header:
         raise CheckpointError(f"{path} must be a checkpoint of probmotion, got no header")

@@ -46,7 +46,8 @@ class Denoise(Conventions):
     """Student-t noise with 3 degrees of freedom, for recordings with outliers."""
 
     correct: FlagCreatePairsOff[bool] = False
-    """Correct the mean with the network body-dvae: smaller errors, .1 s per frame, needs torch."""
+    """Correct the mean with the network body-dvae (.1 s per frame, needs torch); for motion like
+    that of its training clips."""
 
     draws: int = 20
     """Number of posterior draws."""
@@ -60,6 +61,7 @@ class Denoise(Conventions):
         from probmotion.io.files import read_joints
         from probmotion.models.mixture.denoising import denoise_joints
         from probmotion.motion.skeleton import Skeleton
+        from probmotion.problems.denoising import body_prior
         from probmotion.validation import check_count, check_positive
 
         if self.noise is not None:
@@ -75,6 +77,7 @@ class Denoise(Conventions):
         with errors_in(self.file):
             track = track.retarget(Skeleton.preset("person14"))
         writable_folder(self.out)
+        prior = body_prior() if self.correct else None  # fails before minutes of work
         result = denoise_joints(
             track.joints,
             None,
@@ -89,7 +92,7 @@ class Denoise(Conventions):
         if self.correct:
             from probmotion.problems.joint_correction import correct_joints
 
-            result = correct_joints(result, fps=track.fps, seed=self.seed)
+            result = correct_joints(result, fps=track.fps, prior=prior, seed=self.seed)
         _write(track, result, self.out)
         print(_summary(track, result, self.file, self.noise is None))
         print(

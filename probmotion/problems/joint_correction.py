@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["correct_joints"]
 
+_LEAST = 1e-4  # standard deviation of an observation, metres
 _NOISE = 0.02  # metres, of a joint of confidence 1; only its product with confidences matters
 
 
@@ -38,15 +39,16 @@ def correct_joints(
 
     The network's observations are the means of the posterior under the spectral prior, with its
     standard deviations as noise: their posterior under the network's prior is that under the
-    product of both priors, if joints were independent given the recording. The corrected mean is
-    decoded on a body of constant bone lengths. Deviations from the mean remain those under the
-    spectral prior, since the network's are overconfident. Where the network fails, which shows in
-    corrections beyond the standard deviations, the mean remains too, with a warning.
+    product of both priors, if joints were independent given the recording. The network's mean has
+    constant bone lengths. Deviations from the mean remain those under the spectral prior, since the
+    network's are overconfident. Where the network fails, which shows in corrections beyond the
+    standard deviations, the mean remains too, with a warning.
 
     Parameters
     ----------
     found : DenoisedJoints
-        Result of :func:`~probmotion.models.mixture.denoising.denoise_joints`.
+        Result of :func:`~probmotion.models.mixture.denoising.denoise_joints`, with the joints of
+        the prior and the floor at y = 0.
     fps : float
         Frames per second of the recording. At another rate than the prior's, the correction is
         interpolated.
@@ -62,7 +64,8 @@ def correct_joints(
     Raises
     ------
     ValueError
-        If the joints are not those of the prior, or a number is out of range.
+        If the number of joints is not the prior's, the recording has a single frame, a number is
+        out of range, or the optimisation diverges.
     """
     check_positive("fps", fps)
     prior = body_prior() if prior is None else prior
@@ -75,10 +78,11 @@ def correct_joints(
     times = np.arange(0.0, frames[-1] + 1e-9, fps / prior.fps)
     if len(times) < 2:
         raise ValueError(
-            f"found must last at least {2 / prior.fps:.2g} s, got {len(frames)} frames"
+            f"the recording must last at least {2 / prior.fps:.2g} s, got {len(frames) / fps:.2g} s"
         )
     mean = _interpolated(times, frames, found.mean)
     noise = np.sqrt(_interpolated(times, frames, found.sd**2).mean(axis=-1))
+    noise = np.maximum(noise, _LEAST)
     evidence = Joints3D(mean, _NOISE, (_NOISE / noise) ** 2)
     adapted = prior.of(frames=len(times), body=body_of(evidence, prior))
     if iterations:
@@ -91,10 +95,10 @@ def correct_joints(
         )
     correction = corrected.positions - mean
     weight = _plausible(correction / noise[..., None], round(prior.fps))
-    if (lost := 1 - weight.mean()) > 0:
+    if (lost := float((1 - weight).sum()) / prior.fps) > 0:
         warnings.warn(
-            f"the network does not explain {lost:.0%} of the recording; that part of the mean is "
-            "not corrected",
+            f"the network does not explain {lost:.1f} of {len(weight) / prior.fps:.1f} s, where "
+            "the mean is not corrected (is the floor at y = 0?)",
             stacklevel=2,
         )
     correction = _interpolated(frames, times, weight[:, None, None] * correction)
@@ -106,7 +110,7 @@ def _plausible(correction: np.ndarray, second: int) -> np.ndarray:
 
     Given more knowledge, the mean of a distribution moves by at most its standard deviation in the
     root mean square (law of total variance). The weight is 0 where corrections are larger within
-    about a second, since the network fails there, and rises to 1 within half a second.
+    about a second, since the network fails there, and rises to 1 within a second.
     """
     width = second | 1  # odd: centred
     size = np.sqrt(uniform_filter1d((correction**2).mean(axis=(1, 2)), width, mode="nearest"))
