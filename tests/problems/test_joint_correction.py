@@ -14,7 +14,7 @@ from probmotion.problems.joint_correction import _plausible, correct_joints
 from probmotion.samplers import DVAEInference
 
 PERSON = Skeleton.preset("person14")
-SD = 0.02
+SD = 0.01
 
 
 def walk(fps):
@@ -74,7 +74,7 @@ def test_corrections_are_interpolated_at_other_rates(predicted):
 def test_the_mean_is_kept_where_the_network_fails(predicted):
     found = denoised(walk(30.0))
     wrong = np.full((90, 1, 1), 0.5 * SD)
-    wrong[30:40] = 10 * SD
+    wrong[30:40] = 3 * SD
     predicted.append(found.mean + wrong)
     with pytest.warns(UserWarning, match=r"does not explain [12]\.\d of 3\.0 s"):
         corrected = correct_joints(found, fps=30.0, progress=False)
