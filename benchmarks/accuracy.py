@@ -371,8 +371,11 @@ def learnt_figures(folder: Path) -> Figures:
             ratios = [_acceleration(draw) / _acceleration(truth) for draw in corrected.draws]
             accelerations.append(np.median(ratios))
     for name, pairs in errors.items():
-        own, spectral = np.mean(pairs, axis=0)
-        yield f"dvae_over_spectral_{name}", own / spectral
+        own, spectral = np.transpose(pairs)
+        ratio = own.mean() / spectral.mean()
+        yield f"dvae_over_spectral_{name}", ratio
+        error = (own - ratio * spectral).std(ddof=1) / np.sqrt(len(own)) / spectral.mean()
+        yield f"dvae_over_spectral_{name}_standard_error", error
     own, kalman = np.mean(regressions, axis=0)
     yield "dvae_regression_over_kalman", own / kalman
     for name, shares in inside.items():
