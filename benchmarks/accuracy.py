@@ -5,7 +5,8 @@ views), mean over seeds.
 
 ``learnt``: see :func:`learnt_figures`.
 
-``lift``: see ``lift_figures.py``; ``mixing``: see ``mixing_figures.py``.
+``images``, ``lift``, ``mixing``: see ``image_figures.py``, ``lift_figures.py``,
+``mixing_figures.py``.
 
 ``exact-priors``: coverages are mean distances from held-out pose pairs to the nearest lifted
 annotation in interaction coordinates, metres (:func:`probmotion.metrics.coverage.coverage`);
@@ -27,6 +28,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from image_figures import image_figures
 from lift_figures import lift_figures
 from mixing_figures import mixing_figures
 
@@ -452,6 +454,11 @@ def main() -> None:
     )
     command.add_argument("--held-out", nargs="*", default=SALSA_HELD_OUT, help="Salsa clips.")
     commands.add_parser("diffusion", help="Diffusion samplers against exact posteriors.")
+    command = commands.add_parser("images", help="Reconstructions of made images.")
+    command.add_argument("--data", type=Path, help="Folder with recorded dogs; else synthetic.")
+    command.add_argument("--part", choices=["validation", "test"], default="test")
+    command.add_argument("--images", type=int, default=100, help="Number of images.")
+    command.add_argument("--ablations", action="store_true", help="Also without parts of it.")
     command = commands.add_parser("lift", help="Lifts of made videos of held-out clips.")
     command.add_argument("--data", required=True, help="Folder with the real motions.")
     command.add_argument(
@@ -464,6 +471,11 @@ def main() -> None:
     command.add_argument("--data", required=True, help="Folder with the real motions.")
     commands.add_parser("mixing", help="Samplers of many modes within budgets.")
     options = parser.parse_args()
+    if options.command == "images":
+        rest = (options.part, options.images, options.ablations)
+        for name, value in image_figures(options.data, *rest):
+            print(f"{name}: {value:.4g}", flush=True)
+        return
     if options.command == "lift":
         for name, value in lift_figures(Path(options.data), options.lifter):
             print(f"{name}: {value:.4g}", flush=True)

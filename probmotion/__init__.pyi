@@ -32,3 +32,5 @@ from .posteriors.noise_schedule import NoiseSchedule as NoiseSchedule
 from .posteriors.posterior import MotionPosterior as MotionPosterior
 from .posteriors.sampling import Sampler as Sampler, UnsupportedPosterior as UnsupportedPosterior
 from .posteriors.streams import open_draws as open_draws
+from .reconstruction.inference import reconstruct as reconstruct
+from .reconstruction.result import Reconstruction as Reconstruction

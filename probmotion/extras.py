@@ -11,11 +11,14 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    import drjit as drjit
     import ezc3d as ezc3d
     import jax as jax
+    import mitsuba as mitsuba
     import numba as numba
     import numcodecs as numcodecs
     import numpyro as numpyro
+    import skimage as skimage
     import torch as torch
     import zarr as zarr
     from torch import nn as nn
@@ -31,6 +34,9 @@ OPTIONAL = {
     "zarr": "stream",
     "numcodecs": "stream",
     "ezc3d": "c3d",
+    "mitsuba": "images",
+    "drjit": "images",
+    "skimage": "images",
 }
 """Extra of this package that installs a library, by the name to import from this module."""
 

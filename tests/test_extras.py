@@ -13,12 +13,14 @@ import pytest
 from probmotion import extras
 
 ROOT = Path(__file__).parents[1]
+# Distributions that install a library, if other than its name.
+DISTRIBUTIONS = {"nn": "torch", "drjit": "mitsuba", "skimage": "scikit-image"}
 # Runs pytest in a process in which no finder finds the optional libraries.
 WITHOUT = """
 import sys
 import pytest
 
-OPTIONAL = {"torch", "jax", "jaxlib", "numpyro", "numba", "llvmlite", "sklearn", "zarr"}
+OPTIONAL = {"torch", "jax", "jaxlib", "numpyro", "numba", "llvmlite", "sklearn", "zarr", "mitsuba"}
 
 class Without:
     def __init__(self, finder):
@@ -79,7 +81,7 @@ def test_extras_are_those_of_the_package_and_other_names_are_refused():
         project = tomllib.load(file)["project"]
     declared = project["optional-dependencies"]
     for library, extra in extras.OPTIONAL.items():
-        named = "torch" if library == "nn" else library
+        named = DISTRIBUTIONS.get(library, library)
         assert any(each.startswith(named) for each in declared[extra]), library
         assert not any(each.startswith(named) for each in project["dependencies"]), library
     with pytest.raises(AttributeError, match="no library 'numpy'"):

@@ -51,8 +51,8 @@ def test_wheel_contains_every_module_and_nothing_else(wheel):
     }
     data = {
         "py.typed", "data/registry.csv", "plots/animation.css", "plots/animation.js",
-        "plots/picture.js", "report/copy.js", "report/page.css", "report/tables.js",
-        "comparison/measured.csv", "comparison/measured.json",
+        "plots/picture.js", "reconstruction/surface.js", "report/copy.js", "report/page.css",
+        "report/tables.js", "comparison/measured.csv", "comparison/measured.json",
     }  # fmt: skip
     data |= {
         f"problems/references/{name}/{file}"
@@ -70,6 +70,11 @@ def test_wheel_contains_every_module_and_nothing_else(wheel):
         f"{name}{ending}"
         for name in ("walk-vae", "animal-vae")
         for ending in (".md", ".safetensors", "-evaluator.safetensors", "-features.npz")
+    ]
+    weights += [
+        f"{name}-images{ending}"
+        for name in ("quadruped", "person")
+        for ending in (".md", ".npz", ".safetensors")
     ]
     data |= {f"models/weights/{name}" for name in weights}
     assert files == modules | {f"probmotion/{name}" for name in data}

@@ -11,10 +11,10 @@ from pathlib import Path
 from unittest import mock
 
 _COMMANDS = (
-    ("compare",), ("report",), ("which",), ("list",), ("show",), ("convert",), ("denoise",),
-    ("reference",),
+    ("compare",), ("report",), ("which",), ("list",), ("show",), ("convert",), ("lift",),
+    ("pairs",), ("reconstruct",), ("denoise",), ("reference",),
     ("train", "diffusion"), ("train", "evaluator"), ("train", "lifter"), ("train", "dvae"),
-    ("train", "denoiser"), ("train", "motion-vae"),
+    ("train", "denoiser"), ("train", "motion-vae"), ("train", "images"),
 )  # fmt: skip
 
 

@@ -17,6 +17,7 @@ from probmotion.geometry.rotations import vector_to_matrix
 from probmotion.models.bodies.body_states import check_bones, check_single_root, trunk_joints
 from probmotion.models.bodies.joint_ranges import range_of
 from probmotion.motion.kinematics import forward_kinematics
+from probmotion.motion.motion import Motion
 from probmotion.motion.rest_poses import is_four_legged, joint_positions
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_shape
@@ -57,8 +58,8 @@ class ArticulatedBody:
         object.__setattr__(self, "rest", rest)
 
     @cached_property
-    def _rig(self) -> Skeleton:
-        """Skeleton with an additional joint for every trunk, at its lower end."""
+    def rig(self) -> Skeleton:
+        """Skeleton of the joints and an additional one for every trunk, at its lower end."""
         names, parents = list(self.skeleton.joint_names), list(self.skeleton.parents)
         for joint in trunk_joints(self.skeleton):
             names.append(f"{names[joint]} trunk")
@@ -69,13 +70,22 @@ class ArticulatedBody:
     @cached_property
     def _rotating(self) -> tuple[int, ...]:
         """Indices of the rig's joints with children, except the root."""
-        below = set(self._rig.parents) - {self.skeleton.roots[0], -1}
-        return tuple(joint for joint in range(self._rig.n_joints) if joint in below)
+        below = set(self.rig.parents) - {self.skeleton.roots[0], -1}
+        return tuple(joint for joint in range(self.rig.n_joints) if joint in below)
+
+    @property
+    def rig_joints(self) -> tuple[int, ...]:
+        """Joint of the rig with which each bone rotates, by the bone's lower joint; J indices.
+
+        The root has its own index.
+        """
+        above = self.rig.parents[: self.skeleton.n_joints]
+        return tuple(joint if parent < 0 else parent for joint, parent in enumerate(above))
 
     @property
     def bones(self) -> tuple[str, ...]:
         """Names of the joints about which the B bones rotate; trunks last."""
-        return tuple(self._rig.joint_names[joint] for joint in self._rotating)
+        return tuple(self.rig.joint_names[joint] for joint in self._rotating)
 
     @cached_property
     def symmetric(self) -> bool:
@@ -127,7 +137,7 @@ class ArticulatedBody:
                 below = self.rest[children].mean(axis=0)
                 limits.append(range_of(names[joint], animal, self.rest[joint], below))
             else:
-                (end,) = (j for j, parent in enumerate(self._rig.parents) if parent == joint)
+                (end,) = (j for j, parent in enumerate(self.rig.parents) if parent == joint)
                 at_root = parents[end] in self.skeleton.roots
                 name = "trunk" if at_root and names[end] != "tail" else names[end]
                 limits.append(range_of(name, animal, self.rest[end], self.rest[end]))
@@ -165,6 +175,54 @@ class ArticulatedBody:
         log_lengths : Array, (…, G), optional
             Logarithm of the length of each group's bones relative to the rest pose.
         """
+        joints, _ = self._posed(turns, root_rotation, root_translation, log_lengths)
+        return joints[..., : self.skeleton.n_joints, :]
+
+    def bone_frames(
+        self,
+        turns: Array,
+        root_rotation: Array,
+        root_translation: Array,
+        log_lengths: Array | None = None,
+    ) -> tuple[Array, Array]:
+        """Return the upper end (…, L, J, 3), metres, and rotation (…, L, J, 3, 3) of every bone.
+
+        A bone has the index of its lower joint; the root's entry is the root's own frame. Arguments
+        are those of :meth:`positions`.
+        """
+        joints, rotations = self._posed(turns, root_rotation, root_translation, log_lengths)
+        upper = list(self.rig_joints)
+        return joints[..., upper, :], rotations[..., upper, :, :]
+
+    def rig_motion(
+        self,
+        turns: np.ndarray,
+        root_rotation: np.ndarray,
+        root_translation: np.ndarray,
+        log_lengths: np.ndarray,
+        fps: float,
+    ) -> Motion:
+        """Return one motion of the rig with its rotations, whose bones are exactly rigid.
+
+        Arguments are those of :meth:`positions` without batch axes, and the frame rate.
+        """
+        joints, _ = self._posed(turns, root_rotation, root_translation, log_lengths)
+        rest = np.zeros((self.rig.n_joints, 3))
+        rest[: self.skeleton.n_joints] = (
+            self.rest * np.exp(log_lengths)[list(self.length_groups), None]
+        )
+        matrices = vector_to_matrix(turns)
+        rotations = self._rotations(np, matrices, root_rotation, turns.shape[:1])
+        return Motion(joints, self.rig, fps, rotations=rotations, rest_offsets=rest)
+
+    def _posed(
+        self,
+        turns: Array,
+        root_rotation: Array,
+        root_translation: Array,
+        log_lengths: Array | None,
+    ) -> tuple[Array, Array]:
+        """Return positions and rotations of the rig's J' joints."""
         check_shape("turns", turns, ("…", "L", len(self.bones), 3))
         check_shape("root_rotation", root_rotation, ("…", "L", 3, 3))
         check_shape("root_translation", root_translation, ("…", "L", 3))
@@ -178,15 +236,14 @@ class ArticulatedBody:
             batch.append((*log_lengths.shape[:-1], 1))
         shape = np.broadcast_shapes(*(tuple(axes) for axes in batch))
         zero = xp.zeros_like(offsets[..., :1, :])
-        n_trunks = self._rig.n_joints - self.skeleton.n_joints
+        n_trunks = self.rig.n_joints - self.skeleton.n_joints
         rotations = self._rotations(xp, vector_to_matrix(turns), root_rotation, shape)
-        joints, _ = forward_kinematics(
-            self._rig,
+        return forward_kinematics(
+            self.rig,
             rotations,
             xp.broadcast_to(root_translation, (*shape, 3))[..., None, :],
             xp.concat([offsets, *[zero] * n_trunks], axis=-2),
         )
-        return joints[..., : self.skeleton.n_joints, :]
 
     def _rotations(
         self, xp: Any, matrices: Array, root_rotation: Array, shape: tuple[int, ...]
@@ -197,6 +254,6 @@ class ArticulatedBody:
         rotations[self.skeleton.roots[0]] = root_rotation
         each = [
             xp.broadcast_to(rotations.get(joint, identity), (*shape, 3, 3))
-            for joint in range(self._rig.n_joints)
+            for joint in range(self.rig.n_joints)
         ]
         return xp.stack(each, axis=-3)

@@ -1,4 +1,4 @@
-"""The command ``probmotion lift``."""
+"""The commands ``probmotion lift`` and ``probmotion reconstruct``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 if TYPE_CHECKING:
     from probmotion.motion.motion import KeypointTrack
 
-__all__ = ["Lift"]
+__all__ = ["Lift", "Reconstruct"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,3 +156,60 @@ class Lift:
                 raise ValueError(f"person must be 0 to {len(tracks) - 1}, got {self.person}")
             tracks = [tracks[self.person]]
         return tracks if self.camera is None else [replace(t, name=path.stem) for t in tracks]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reconstruct:
+    """Reconstruct an animal or person from one image or the images of a clip, in 3D and motion.
+
+    Writes to --out: reconstruct.html (the images, other views and posterior draws in motion),
+    body.glb (coloured surface with a skeleton and a motion, for Blender), reconstruction.npz (the
+    motion and all draws) and summary.json.
+    """
+
+    image: Positional[tuple[Path, ...]]
+    """Image, or all images of a clip, in the order of time and of one size."""
+
+    mask: tuple[Path, ...] = ()
+    """Mask of the body, one for each image; the image's opacity by default."""
+
+    features: tuple[Path, ...] = ()
+    """Image features (.npz, one array of rows, columns and channels), one file for each image."""
+
+    category: str
+    """Kind of body: quadruped, person, or the file of a trained category."""
+
+    out: Path
+    """Output folder."""
+
+    fov: Annotated[float, arg(metavar="DEGREES", help_behavior_hint="")] = 40.0
+    """Field of view along the longer side of the image, degrees; 40 by default."""
+
+    draws: int = 100
+    """Number of posterior draws."""
+
+    seed: int = 0
+    """Seed of the draws."""
+
+    def run(self) -> None:
+        from probmotion.files import writable_folder
+        from probmotion.models.images.category import Category
+        from probmotion.models.images.observation import ImageObservation
+        from probmotion.reconstruction.inference import reconstruct
+
+        category = Category.load(self.category)
+        observation = ImageObservation.read(
+            _one_or_all(self.image),
+            _one_or_all(self.mask) if self.mask else None,
+            features=_one_or_all(self.features) if self.features else None,
+            fov=self.fov,
+        )
+        writable_folder(self.out)
+        result = reconstruct(observation, category, draws=self.draws, seed=self.seed)
+        result.save(self.out)
+        print("\n".join(result.summary()))
+        print(f"wrote {self.out / 'reconstruct.html'}, body.glb, reconstruction.npz, summary.json")
+
+
+def _one_or_all(paths: tuple[Path, ...]) -> Path | list[Path]:
+    return paths[0] if len(paths) == 1 else list(paths)

@@ -17,7 +17,7 @@ from typing import Any
 from probmotion.cli.compare import Compare
 from probmotion.cli.denoise import Denoise
 from probmotion.cli.files import Convert, Report, Show
-from probmotion.cli.lift import Lift
+from probmotion.cli.lift import Lift, Reconstruct
 from probmotion.cli.pairs import Pairs
 from probmotion.cli.reference import Reference
 from probmotion.cli.which import Which
@@ -29,17 +29,18 @@ _OVERVIEW = """usage: probmotion COMMAND [OPTIONS]
 Sample posteriors over 3D motion and measure the errors of samplers.
 
 commands:
-  compare    run samplers on the same posteriors and measure their errors
-  report     write the report of a comparison again, from its folder
-  which      recommend a sampler for a problem, from measurements
-  list       list the named problems, samplers and skeletons
-  show       summarise a file, or a network, sampler or problem by name
-  convert    convert a motion to another format, frame rate or skeleton
-  lift       lift a video's 2D keypoints to 3D motion, for Blender and the browser
-  pairs      lift two people who interact, from a video's 2D keypoints and one 3D pose-pair
-  denoise    denoise recorded 3D joints and fill gaps
-  train      train a prior, or a network for evaluating priors
-  reference  generate certified reference draws of a problem
+  compare      run samplers on the same posteriors and measure their errors
+  report       write the report of a comparison again, from its folder
+  which        recommend a sampler for a problem, from measurements
+  list         list the named problems, samplers and skeletons
+  show         summarise a file, or a network, sampler or problem by name
+  convert      convert a motion to another format, frame rate or skeleton
+  lift         lift a video's 2D keypoints to 3D motion, for Blender and the browser
+  pairs        lift two people who interact, from a video's 2D keypoints and one 3D pose-pair
+  reconstruct  reconstruct an animal or person in 3D and motion, from one image and its mask
+  denoise      denoise recorded 3D joints and fill gaps
+  train        train a prior, or a network for evaluating priors
+  reference    generate certified reference draws of a problem
 
 probmotion COMMAND --help lists the options of a command.
 probmotion --version prints the version."""
@@ -87,7 +88,8 @@ def _first_line(kind: Any) -> str:
 
 _COMMANDS: dict[str, type[Any]] = {
     "compare": Compare, "report": Report, "which": Which, "list": List, "show": Show,
-    "convert": Convert, "denoise": Denoise, "lift": Lift, "pairs": Pairs, "reference": Reference,
+    "convert": Convert, "denoise": Denoise, "lift": Lift, "pairs": Pairs,
+    "reconstruct": Reconstruct, "reference": Reference,
 }  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import OmitArgPrefixes
 
 from probmotion.cli.track_options import TrackData, learning_tracks
-from probmotion.cli.train_bodies import TrainDenoiser, TrainDVAE
+from probmotion.cli.train_bodies import TrainDenoiser, TrainDVAE, TrainImages
 from probmotion.cli.train_motion_vae import TrainMotionVAE
 from probmotion.cli.training_options import Steps, check_out, run_training
 
@@ -149,5 +149,6 @@ TRAINABLE: dict[str, type[Any]] = {
     "dvae": TrainDVAE,
     "denoiser": TrainDenoiser,
     "motion-vae": TrainMotionVAE,
+    "images": TrainImages,
 }
 """Trainable networks by name."""

@@ -1,4 +1,4 @@
-"""The commands ``probmotion train dvae`` and ``probmotion train denoiser``."""
+"""The commands ``probmotion train dvae``, ``denoiser`` and ``images``."""
 
 from __future__ import annotations
 
@@ -18,12 +18,17 @@ from probmotion.cli.training_options import (
 )
 
 if TYPE_CHECKING:
+    from probmotion.models.images.category import Category
+    from probmotion.models.images.encoder import EncoderNetwork
+    from probmotion.models.images.observation import ImageObservation
+    from probmotion.models.training.settings import TrainingSettings
     from probmotion.motion.motion import Motion
     from probmotion.motion.skeleton import Skeleton
 
-__all__ = ["TrainDVAE", "TrainDenoiser"]
+__all__ = ["TrainDVAE", "TrainDenoiser", "TrainImages"]
 
 Size = Literal["tiny", "small", "paper"]
+_FRAMES, _SIZE = 5, 64  # images of a generated clip; pixels of images
 
 
 @dataclass(frozen=True)
@@ -157,6 +162,138 @@ class TrainDenoiser:
             seed=settings.seed,
         )
         run_training(trainee, settings, self.out, self.training.device)
+
+
+@dataclass(frozen=True)
+class TrainImages:
+    """Train a kind of body for probmotion reconstruct, from clips of images and masks.
+
+    Learns the mean surface and colours in rounds and writes category.npz after each; then trains
+    the encoder and writes model.safetensors and losses.csv. Run the same command again to resume
+    an interrupted run.
+    """
+
+    out: Path
+    """Output folder."""
+
+    category: str = "quadruped"
+    """Category to start from: quadruped, person, or the file of a category."""
+
+    clips: tuple[Path, ...] = ()
+    """Folders of clips with images/NAME.png (or .jpg) and masks/NAME.png.
+    Default: generated images of an animal with another surface and coat."""
+
+    images: int = 200
+    """Number of images to learn from, evenly spread over the clips."""
+
+    rounds: int = 2
+    """Number of rounds; each estimates all poses (3 s per image), then surface and colours."""
+
+    fov: float = 40.0
+    """Field of view of the clips' cameras along the longer side, degrees."""
+
+    data_seed: int = 0
+    """Seed of the generated images."""
+
+    training: OmitArgPrefixes[Steps] = field(default_factory=Steps)
+
+    def run(self) -> None:
+        from probmotion.models.images.category import Category
+        from probmotion.models.images.encoder_training import KIND, EncoderTrainee
+        from probmotion.models.training.runs import steps_taken
+        from probmotion.models.training.settings import TrainingSettings
+        from probmotion.reconstruction.learning import (
+            CATEGORY,
+            check_rounds,
+            learn_category,
+            rounds_done,
+        )
+        from probmotion.validation import check_count
+
+        defaults = TrainingSettings(steps=4000, learning_rate=1.5e-3, ema=0.99)
+        settings = self.training.settings(defaults)
+        check_out(self.out)
+        check_count("images", self.images)
+        check_count("data_seed", self.data_seed, least=0)
+        start = Category.load(self.category)
+        images = self._images(start)
+        check_rounds(start, images, self.out, self.rounds)
+        done = rounds_done(self.out)
+        if done < self.rounds and steps_taken(self.out, KIND):
+            raise ValueError(
+                f"rounds must be {done} to resume {self.out}, whose encoder is in training, got "
+                f"{self.rounds}; use another folder"
+            )
+        if done < self.rounds:
+            network = self._start_encoder(start, settings)
+            learn_category(start, network, images, self.out, rounds=self.rounds)
+        category = Category.load(self.out / CATEGORY)
+        print(f"{self.out / CATEGORY}: {self.rounds} rounds of {len(images)} images")
+        trainee = EncoderTrainee(category, settings.seed)
+        run_training(trainee, settings, self.out, self.training.device)
+
+    def _images(self, category: Category) -> list[ImageObservation]:
+        import numpy as np
+
+        from probmotion import seeds
+        from probmotion.models.images.made_images import make_category, make_clips
+        from probmotion.models.images.observation import ImageObservation
+
+        if not self.clips:
+            rng = seeds.generator(self.data_seed, "clips")
+            animal = make_category(category, rng)
+            count = -(-self.images // _FRAMES)
+            images, _ = make_clips(animal, rng, count, _FRAMES, _SIZE)
+            return images[: self.images]
+        clips = [_masked_images(folder) for folder in self.clips]
+        most = -(-self.images // len(clips))
+        images = []
+        for clip in clips:
+            chosen = np.unique(np.linspace(0, len(clip) - 1, most).round().astype(int))
+            for image, mask in (clip[k] for k in chosen):
+                images.append(ImageObservation.read(image, mask, fov=self.fov, size=_SIZE))
+        return images[: self.images]
+
+    def _start_encoder(self, start: Category, settings: TrainingSettings) -> EncoderNetwork:
+        """Return the encoder beside the category's file, or else train one."""
+        from probmotion.models.images.encoder_training import (
+            EncoderTrainee,
+            encoder_of,
+            load_encoder,
+        )
+
+        try:
+            return encoder_of(start)
+        except FileNotFoundError:
+            folder = self.out / "start"
+            print(f"{self.category} has no encoder beside its file: trained first, in {folder}")
+            trainee = EncoderTrainee(start, settings.seed)
+            run_training(trainee, settings, folder, self.training.device)
+            return load_encoder(folder, start)
+
+
+def _masked_images(folder: Path) -> list[tuple[Path, Path]]:
+    """Return the images of a clip and their masks, sorted by name."""
+    found: dict[str, dict[str, Path]] = {}
+    for part in ("images", "masks"):
+        suffixes = {".png", ".jpg"} if part == "images" else {".png"}
+        if not (folder / part).is_dir():
+            raise ValueError(f"clips must be folders with images and masks, got no {folder / part}")
+        files = [path for path in sorted((folder / part).iterdir()) if path.suffix in suffixes]
+        found[part] = {path.stem: path for path in files}
+        if not files:
+            raise ValueError(
+                f"clips must contain {' or '.join(sorted(suffixes))}, got none in {folder / part}"
+            )
+        if len(found[part]) < len(files):
+            raise ValueError(f"images of a clip must have unique names, got two in {folder / part}")
+    images, masks = found["images"], found["masks"]
+    if odd := sorted(images.keys() ^ masks.keys()):
+        raise ValueError(
+            f"images and masks of a clip must have the same names, got {odd[0]} in only one of the "
+            f"folders of {folder}"
+        )
+    return [(images[name], masks[name]) for name in images]
 
 
 def _learning_clips(

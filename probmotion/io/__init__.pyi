@@ -1,5 +1,6 @@
 from .amc import read_amc as read_amc
 from .asf import AcclaimSkeleton as AcclaimSkeleton, read_asf as read_asf
+from .body_mesh import BodyMesh as BodyMesh
 from .bvh import read_bvh as read_bvh
 from .bvh_writing import write_bvh as write_bvh
 from .errors import MotionFileError as MotionFileError, MotionFileWarning as MotionFileWarning

@@ -14,10 +14,11 @@ import numpy as np
 
 from probmotion.files import written_whole
 from probmotion.geometry.rotations import matrix_to_quaternion
-from probmotion.io._body_mesh import body_mesh
+from probmotion.io.body_mesh import BodyMesh, body_mesh
 from probmotion.motion.inverse_kinematics import rigid_motion
 from probmotion.motion.motion import Motion
 from probmotion.motion.rest_poses import joint_positions
+from probmotion.validation import check_finite, check_shape
 
 __all__ = ["write_glb"]
 
@@ -25,36 +26,62 @@ _FLOAT, _SHORT, _INT = 5126, 5123, 5125  # component types
 _VERTICES, _INDICES = 34962, 34963  # buffer view targets
 _COMPONENTS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 _COLOUR = [0.42, 0.53, 0.68, 1.0]
+_WHITE = [1.0, 1.0, 1.0, 1.0]
 
 
-def write_glb(motion: Motion, path: str | Path) -> None:
+def write_glb(motion: Motion, path: str | Path, mesh: BodyMesh | None = None) -> None:
     """Write a motion to a GLB file, in metres and atomically.
 
     The file contains a skeleton of rigid bones, an animation with a rotation of every joint and a
-    translation of every root, and a body of capsules that moves with the skeleton. The bind pose is
-    the rest pose, with its feet at height 0. ``extras`` of the animation contain ``fps``. A motion
-    without rotations is converted as by :func:`~probmotion.io.bvh_writing.write_bvh`.
+    translation of every root, and a body that moves with the skeleton. The bind pose is the rest
+    pose, with its feet at height 0. ``extras`` of the animation contain ``fps``. A motion without
+    rotations is converted as by :func:`~probmotion.io.bvh_writing.write_bvh`.
+
+    Parameters
+    ----------
+    motion : Motion
+        Motion with J joints.
+    path : str or Path
+        Name of the file.
+    mesh : BodyMesh, optional
+        Body in the rest pose of ``motion``, relative to its only root, with joints of ``motion``
+        that move each vertex and perhaps colours; capsules by default.
 
     Raises
     ------
     OSError
         If the folder is missing or not writable.
+    ValueError
+        If a mesh is given for a motion of several roots or without rotations of rigid bones, or an
+        array of the mesh has a wrong shape or range.
 
     Warns
     -----
     UserWarning
         If the positions cannot be reproduced by rigid bones.
     """
-    motion = rigid_motion(motion)
+    given, motion = motion, rigid_motion(motion)
     skeleton, roots = motion.skeleton, list(motion.skeleton.roots)
     offsets = np.array(motion.rest_offsets)
     offsets[roots] = motion.positions[0, roots] * [1.0, 0.0, 1.0]
-    offsets[roots, 1] -= body_mesh(skeleton, _rest(motion, offsets)).vertices[:, 1].min()
-    rest = _rest(motion, offsets)
+    if mesh is None:
+        offsets[roots, 1] -= body_mesh(skeleton, _rest(motion, offsets)).vertices[:, 1].min()
+        rest = _rest(motion, offsets)
+        mesh = body_mesh(skeleton, rest)
+    else:
+        _check_mesh(mesh, motion)
+        if motion is not given:
+            raise ValueError(
+                "motion must have rotations and rest offsets that reproduce its positions if a "
+                "mesh is given, got others; pass rigid_motion(motion) and a mesh of its rest pose"
+            )
+        offsets[roots, 1] = -mesh.vertices[:, 1].min()
+        rest = _rest(motion, offsets)
+        mesh = mesh._replace(vertices=mesh.vertices + offsets[roots])
     buffer = _Buffer()
     bind = np.tile(np.eye(4), (skeleton.n_joints, 1, 1))
     bind[:, 3, :3] = -rest  # transposed: glTF stores matrices column by column
-    primitive = _primitive(buffer, motion, rest)
+    primitive = _primitive(buffer, mesh)
     binds = buffer.add(bind.reshape(-1, 16), _FLOAT)
     animation = _animation(buffer, motion)
     nodes: list[dict[str, Any]] = []
@@ -74,7 +101,7 @@ def write_glb(motion: Motion, path: str | Path) -> None:
             {
                 "name": "body",
                 "pbrMetallicRoughness": {
-                    "baseColorFactor": _COLOUR,
+                    "baseColorFactor": _COLOUR if mesh.colours is None else _WHITE,
                     "metallicFactor": 0.0,
                     "roughnessFactor": 0.7,
                 },
@@ -137,8 +164,29 @@ def _rest(motion: Motion, offsets: np.ndarray) -> np.ndarray:
     return rest
 
 
-def _primitive(buffer: _Buffer, motion: Motion, rest: np.ndarray) -> dict[str, Any]:
-    mesh = body_mesh(motion.skeleton, rest)
+def _check_mesh(mesh: BodyMesh, motion: Motion) -> None:
+    if len(motion.skeleton.roots) != 1:
+        raise ValueError(
+            f"motion must have one root if a mesh is given, got {len(motion.skeleton.roots)}"
+        )
+    n = len(mesh.vertices)
+    shapes = {"vertices": 3, "normals": 3, "joints": 4, "weights": 4}
+    for name, width in (shapes if mesh.colours is None else {**shapes, "colours": 3}).items():
+        check_shape(name, getattr(mesh, name), (n, width))
+        check_finite(name, getattr(mesh, name))
+    check_shape("triangles", mesh.triangles, ("T", 3))
+    for name, limit in (("triangles", n), ("joints", motion.skeleton.n_joints)):
+        low, high = getattr(mesh, name).min(), getattr(mesh, name).max()
+        if low < 0 or high >= limit:
+            raise ValueError(f"{name} must be between 0 and {limit - 1}, got {low} to {high}")
+    if mesh.colours is not None and not ((mesh.colours >= 0) & (mesh.colours <= 1)).all():
+        raise ValueError(
+            f"colours must be between 0 and 1, got {mesh.colours.min():.4g} to "
+            f"{mesh.colours.max():.4g}"
+        )
+
+
+def _primitive(buffer: _Buffer, mesh: BodyMesh) -> dict[str, Any]:
     weights = mesh.weights.astype(np.float32)
     weights[:, 0] = 1 - weights[:, 1:].sum(axis=1)
     attributes = {
@@ -147,6 +195,8 @@ def _primitive(buffer: _Buffer, motion: Motion, rest: np.ndarray) -> dict[str, A
         "JOINTS_0": buffer.add(mesh.joints, _SHORT, _VERTICES),
         "WEIGHTS_0": buffer.add(weights, _FLOAT, _VERTICES),
     }
+    if mesh.colours is not None:
+        attributes["COLOR_0"] = buffer.add(mesh.colours, _FLOAT, _VERTICES)
     indices = buffer.add(mesh.triangles.reshape(-1, 1), _INT, _INDICES)
     return {"attributes": attributes, "indices": indices, "material": 0}
 

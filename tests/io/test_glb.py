@@ -10,7 +10,10 @@ import pytest
 
 from probmotion import Motion, Skeleton, load, save
 from probmotion.data.synthetic.gaits import make_gait
+from probmotion.io.body_mesh import BodyMesh, body_mesh
+from probmotion.io.glb import write_glb
 from probmotion.motion.inverse_kinematics import rigid_motion
+from probmotion.motion.rest_poses import joint_positions
 
 DTYPES = {5126: "<f4", 5123: "<u2", 5125: "<u4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -147,9 +150,75 @@ def test_skinned_joints_follow_the_rigid_motion(tmp_path, kind):
     np.testing.assert_allclose(moved[..., :3], rigid.positions, atol=1e-5)
 
 
-@pytest.mark.parametrize("kind", MOTIONS)
+def coloured_walk():
+    """A rigid motion and a mesh relative to its root: the capsules above the pelvis, in colours."""
+    motion = rigid_motion(walk())
+    rest = joint_positions(motion.skeleton, motion.rest_offsets)
+    mesh = body_mesh(motion.skeleton, rest)
+    n = len(mesh.vertices) // 2
+    mesh = BodyMesh(*(array[:n] for array in mesh[:2]), mesh.triangles, *(a[:n] for a in mesh[3:5]))
+    mesh = mesh._replace(triangles=mesh.triangles[(mesh.triangles < n).all(axis=1)])
+    return motion, mesh._replace(colours=np.random.default_rng(0).uniform(size=(n, 3)))
+
+
+def write(kind, path):
+    if kind == "coloured":
+        motion, mesh = coloured_walk()
+        write_glb(motion, path, mesh)
+    else:
+        save(MOTIONS[kind](), path)
+
+
+def test_given_meshes_are_written_with_their_colours(tmp_path):
+    motion, mesh = coloured_walk()
+    write_glb(motion, tmp_path / "clip.glb", mesh)
+    scene = Scene(tmp_path / "clip.glb")
+    arrays, triangles = scene.mesh()
+    np.testing.assert_array_equal(triangles, mesh.triangles)
+    for name, values in (
+        ("NORMAL", mesh.normals),
+        ("JOINTS_0", mesh.joints),
+        ("WEIGHTS_0", mesh.weights),
+        ("COLOR_0", mesh.colours),
+    ):
+        np.testing.assert_allclose(arrays[name], values, atol=1e-6)
+    (material,) = scene.json["materials"]
+    assert material["pbrMetallicRoughness"]["baseColorFactor"] == [1, 1, 1, 1]
+    # The mesh keeps its place relative to the root, below which it stands on the floor.
+    binds = scene.array(scene.json["skins"][0]["inverseBindMatrices"]).reshape(-1, 4, 4)
+    root = -binds[motion.skeleton.roots[0], 3, :3]
+    np.testing.assert_allclose(arrays["POSITION"], mesh.vertices + root, atol=1e-6)
+    assert arrays["POSITION"][:, 1].min() == pytest.approx(0.0, abs=1e-6)
+    world, _ = scene.transforms()
+    joints = world[:, : motion.skeleton.n_joints, :3, 3]
+    np.testing.assert_allclose(joints, motion.positions, atol=1e-5)
+
+
+def test_capsules_have_the_default_colour(tmp_path):
+    save(walk(), tmp_path / "clip.glb")
+    scene = Scene(tmp_path / "clip.glb")
+    assert "COLOR_0" not in scene.mesh()[0]
+    assert scene.json["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"][0] < 1
+
+
+def test_meshes_that_do_not_fit_are_errors(tmp_path):
+    motion, mesh = coloured_walk()
+    high = mesh.joints + motion.skeleton.n_joints
+    for one, other, message in (
+        (noisy_walk(), mesh, "motion must have rotations"),
+        (rigid_motion(ball_and_person()), mesh, "motion must have one root .* got 2"),
+        (motion, mesh._replace(joints=high), "joints must be between 0 and"),
+        (motion, mesh._replace(colours=2 + mesh.colours), "colours must be between 0 and 1"),
+        (motion, mesh._replace(colours=mesh.colours[:5]), "colours must have shape"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            write_glb(one, tmp_path / "clip.glb", other)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kind", [*MOTIONS, "coloured"])
 def test_files_satisfy_the_specification(tmp_path, kind):
-    save(MOTIONS[kind](), tmp_path / "clip.glb")
+    write(kind, tmp_path / "clip.glb")
     scene = Scene(tmp_path / "clip.glb")
     arrays, triangles = scene.mesh()
     vertices, normals = arrays["POSITION"].astype(float), arrays["NORMAL"].astype(float)
@@ -201,7 +270,7 @@ def test_the_body_moves_with_its_bones(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", MOTIONS)
+@pytest.mark.parametrize("kind", [*MOTIONS, "coloured"])
 def test_khronos_validator_finds_no_issue(tmp_path, kind):
     node = shutil.which("node")
     found = node and subprocess.run(
@@ -209,7 +278,7 @@ def test_khronos_validator_finds_no_issue(tmp_path, kind):
     )
     if not found or found.returncode:
         pytest.skip("node with the package gltf-validator (in NODE_PATH) is not installed")
-    save(MOTIONS[kind](), tmp_path / "clip.glb")
+    write(kind, tmp_path / "clip.glb")
     command = [node, "-e", VALIDATE, str(tmp_path / "clip.glb")]
     issues = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
     assert (issues["numErrors"], issues["numWarnings"], issues["messages"]) == (0, 0, [])

@@ -227,3 +227,21 @@ def test_from_video_to_blender(tmp_path, monkeypatch):
     for name, ratio in {"fov 40°": 1.59, "fov 80°": 0.69, "height 1.5 m": 1.5 / 1.7}.items():
         assert rows[name] / rows["nothing given"] == pytest.approx(ratio, rel=0.1)
     assert printed.count("Do not trust this motion") == 2
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+def test_from_one_image(tmp_path, monkeypatch):
+    printed = run("09_from_one_image.py", tmp_path, 3, monkeypatch)
+    assert "A body of the category quadruped explains the image." in printed
+    error = float(re.search(r"^error of joints.* ([\d.]+)$", printed, re.MULTILINE)[1])
+    assert error < 8
+    # In all posteriors, depth is less certain than the place in the image.
+    across, depth = (
+        [float(value) for value in re.findall(rf"^{name}, mm +([\d.]+)", printed, re.MULTILINE)]
+        for name in ("sd across the image", "sd in depth")
+    )
+    assert all(a < d for a, d in zip(across, depth, strict=True))
+    assert {path.suffix for path in (tmp_path / "animal").iterdir()} >= {".glb", ".html", ".npz"}
+    assert printed.count("a star: Do not trust this reconstruction") == 1
+    assert printed.count("a square: A body") == 1

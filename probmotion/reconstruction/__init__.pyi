@@ -1,0 +1,2 @@
+from .inference import reconstruct as reconstruct
+from .result import Reconstruction as Reconstruction

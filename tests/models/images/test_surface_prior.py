@@ -1,0 +1,194 @@
+"""Bodies posed in front of a camera, their images and the density of observed ones."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import maximum_filter
+
+from probmotion.models.images.image_likelihood import ImageLikelihood
+from probmotion.models.images.made_images import make_images
+from probmotion.models.images.observation import ImageObservation
+from probmotion.models.images.posing import shaded
+from probmotion.models.images.surface_prior import SurfacePrior
+from probmotion.posteriors.posterior import MotionPosterior
+from tests.models.images.meshes import icosphere
+
+SIZE, TANGENT = 64, 0.15
+
+
+@pytest.fixture(scope="module")
+def prior(category):
+    return SurfacePrior(category, np.array([TANGENT]))
+
+
+@pytest.fixture(scope="module")
+def made(prior):
+    return make_images(prior, np.random.default_rng(0), 6, SIZE)
+
+
+def observed(made, k: int) -> ImageObservation:
+    return ImageObservation(
+        made.mask[k][None], made.rgb[k][None], None, np.array([TANGENT]), np.eye(3)[None]
+    )
+
+
+def test_surface_moves_with_the_body(category) -> None:
+    """At rest it is the rest surface; a bone's turn moves its vertices rigidly."""
+    body, surface = category.body, category.surface
+    rest = torch.as_tensor(surface.vertices)[None]
+    turns = torch.zeros(1, 1, len(body.bones), 3, dtype=torch.float64)
+    still = (torch.eye(3, dtype=torch.float64)[None, None], torch.zeros(1, 1, 3).double())
+    lengths = torch.zeros(1, body.n_groups, dtype=torch.float64)
+    posed = category.skin.posed(rest, turns, *still, lengths)
+    torch.testing.assert_close(posed[0, 0], rest[0], rtol=0, atol=1e-12)
+
+    elbow = body.skeleton.joint_names.index("left_elbow")
+    turns[..., body.bones.index("left_elbow"), 0] = 0.7
+    posed = category.skin.posed(rest, turns, *still, lengths)[0, 0].numpy()
+    joints = body.positions(turns, *still, lengths)[0, 0].numpy()
+    wrist = body.skeleton.joint_names.index("left_wrist")
+    own = surface.weights[np.arange(len(rest[0])), (surface.joints == wrist).argmax(axis=1)]
+    rigid = np.flatnonzero((surface.joints == wrist).any(axis=1) & (own > 0.999))
+    assert len(rigid) > 2
+    before = surface.vertices[rigid] - body.rest_positions[elbow]
+    after = posed[rigid] - joints[elbow]
+    np.testing.assert_allclose(
+        np.linalg.norm(after, axis=1), np.linalg.norm(before, axis=1), rtol=1e-3
+    )
+    assert np.abs(after - before).max() > 0.02
+
+
+def test_joints_are_inside_the_silhouette(prior, made) -> None:
+    joints = prior.motion(made.theta)[:, 0] * [1.0, -1.0, -1.0]
+    with torch.no_grad():
+        images = prior.render(torch.as_tensor(made.theta), SIZE)[:, 0, ..., 3]
+    places = joints[..., :2] / (joints[..., 2:] * TANGENT)
+    cells = np.floor(0.5 * SIZE * (1 + places)).astype(int)
+    inside = ((cells >= 0) & (cells < SIZE)).all(axis=-1)
+    rows = np.arange(len(joints))[:, None]
+    x, y = np.moveaxis(cells.clip(0, SIZE - 1), -1, 0)
+    # Paws are hardly wider than a pixel.
+    near = maximum_filter(images.numpy(), (1, 3, 3))[rows, y, x]
+    assert near[inside].mean() > 0.94
+    mirrored = maximum_filter(images.numpy()[..., ::-1], (1, 3, 3))[rows, y, x]
+    assert mirrored[inside].mean() < 0.9
+
+
+def test_made_bodies_fill_the_crop_and_are_cut_off_at_one_side(prior) -> None:
+    made = make_images(prior, np.random.default_rng(1), 60, SIZE)
+    unknown = np.isnan(made.mask).any(axis=(1, 2))
+    assert 0.05 < unknown.mean() < 0.5
+    body = np.nan_to_num(made.mask) >= 0.5
+    rows, columns = body.any(axis=2), body.any(axis=1)
+    larger = np.maximum(rows.sum(axis=1), columns.sum(axis=1)) / SIZE
+    assert larger.mean() == pytest.approx(1 / 1.25, abs=0.05)
+
+
+@pytest.mark.parametrize("yaw", [0.0, math.pi / 2, -2.5])
+def test_bodies_face_where_they_are_told(prior, yaw: float) -> None:
+    theta = prior.facing(np.zeros((1, prior.dim)), np.array([yaw]))
+    joints = prior.motion(theta)[0, 0]
+    names = prior.skeleton.joint_names
+    ahead = joints[names.index("neck")] - joints[names.index("pelvis")]
+    # X is the image's right, Z towards the camera.
+    assert math.atan2(ahead[0], ahead[2]) == pytest.approx(yaw, abs=0.3)
+
+
+def test_density_has_the_derivative_of_finite_differences(prior, made) -> None:
+    posterior = MotionPosterior(prior, observed(made, 0))
+    theta = torch.as_tensor(made.theta[:1]).requires_grad_()
+    value = posterior.log_density(theta)
+    value.sum().backward()
+    assert theta.grad is not None
+    rng = np.random.default_rng(2)
+    for _ in range(3):
+        direction = rng.standard_normal(prior.dim)
+        step = 1e-6 * direction
+        ends = posterior.log_density(made.theta[:1] + np.array([[1], [-1]]) * step)
+        slope = float((ends[0] - ends[1]) / 2e-6)
+        assert float((theta.grad[0].numpy() * direction).sum()) == pytest.approx(slope, rel=0.05)
+    prior_density = prior.log_density(made.theta[:1])
+    likelihood = prior.log_likelihood(made.theta[:1], observed(made, 0))
+    assert value.item() == pytest.approx(float(prior_density[0] + likelihood[0]), rel=1e-6)
+
+
+def test_images_do_not_depend_on_the_batch(prior, made) -> None:
+    observation = observed(made, 0)
+    together = prior.log_likelihood(made.theta, observation)
+    alone = [prior.log_likelihood(theta[None], observation)[0] for theta in made.theta]
+    np.testing.assert_allclose(together, alone, rtol=1e-9)
+    assert np.argmax(together) == 0
+
+
+def test_curvature_has_the_gradient_of_the_density(prior, made) -> None:
+    theta = torch.as_tensor(made.theta[0]).requires_grad_()
+    likelihood = ImageLikelihood.of(observed(made, 1), SIZE, torch.float64)
+    images = prior.render(theta[None], SIZE)[0]
+    likelihood.log_density(images[None]).sum().backward()
+    step = 1e-6
+    moved = torch.stack([theta.detach() + step * row for row in torch.eye(prior.dim).double()])
+    with torch.no_grad():
+        derivatives = (prior.render(moved, SIZE) - images) / step
+    slope, information = likelihood.curvature(images.detach(), derivatives)
+    torch.testing.assert_close(slope, theta.grad, rtol=0.02, atol=0.02)
+    assert float(torch.linalg.eigvalsh(information).min()) > -1e-6
+
+
+def test_unknown_pixels_do_not_count(prior, made) -> None:
+    whole = observed(made, 2)
+    mask = whole.mask.copy()
+    mask[:, :, : SIZE // 2] = np.nan
+    part = ImageObservation(mask.copy(), whole.rgb, None, whole.tangent, whole.rotation)
+    mask[:, :, : SIZE // 2] = 1.0 - whole.mask[:, :, : SIZE // 2]
+    values = [prior.log_likelihood(made.theta[2:3], each)[0] for each in (whole, part)]
+    wrong = ImageObservation(mask.clip(0, 1), whole.rgb, None, whole.tangent, whole.rotation)
+    assert prior.log_likelihood(made.theta[2:3], wrong)[0] < values[0] < values[1]
+
+
+def test_the_path_of_a_clip_begins_at_the_first_pose(category) -> None:
+    clip = SurfacePrior(category, np.full(3, TANGENT))
+    single = SurfacePrior(category, np.array([TANGENT]))
+    rng = np.random.default_rng(3)
+    theta = clip.initial(rng, 2)
+    first = np.delete(theta, np.s_[single.dim :], axis=1)
+    with torch.no_grad():
+        images = clip.render(torch.as_tensor(theta), 32)
+        alone = single.render(torch.as_tensor(first), 32)
+    torch.testing.assert_close(images[:, :1], alone)
+    still = theta.copy()
+    still[:, single.dim :] = 0.0
+    with torch.no_grad():
+        vertices = clip.parameters(torch.as_tensor(still)).rotation
+    torch.testing.assert_close(vertices[:, 0], vertices[:, 2])
+    with pytest.raises(ValueError, match="at most 10"):
+        SurfacePrior(category, np.full(11, TANGENT))
+
+
+def test_light_from_one_side(prior) -> None:
+    """Lambert's law on a ball: ambient behind, ambient plus the cosine in front."""
+    vertices, triangles = icosphere(3)
+    points = torch.tensor(vertices)[None]
+    light, ambient = torch.tensor([[0.0, 0.0, 0.6]]).double(), torch.tensor([0.3]).double()
+    radiance = shaded(points, triangles, torch.ones_like(points), light, ambient)[0, :, 0]
+    expected = 0.3 + 0.6 * points[0, :, 2].clamp(min=0)
+    torch.testing.assert_close(radiance, expected, rtol=0, atol=0.01)
+
+
+def test_the_second_renderer_gives_the_same_density(category, made) -> None:
+    pytest.importorskip("mitsuba", reason="mitsuba is not installed")
+    from probmotion.models.images.mitsuba_renderer import MitsubaRenderer
+
+    try:
+        renderer = MitsubaRenderer(256)
+        other = SurfacePrior(category, np.array([TANGENT]), renderer)
+        images = other.render(torch.as_tensor(made.theta[:2]), SIZE)
+    except (ImportError, RuntimeError, OSError) as error:
+        pytest.skip(f"LLVM is not installed: {error}")
+    own = SurfacePrior(category, np.array([TANGENT])).render(torch.as_tensor(made.theta[:2]), SIZE)
+    coverage = (images[..., 3] - own[..., 3]).abs()
+    assert float(coverage.sum() / own[..., 3].sum()) < 0.03
+    assert float((images[..., :3] - own[..., :3]).abs().mean()) < 0.002

@@ -1,0 +1,102 @@
+"""The command ``probmotion reconstruct``: what it reads, prints and refuses."""
+
+from __future__ import annotations
+
+import sys
+from types import ModuleType
+
+import numpy as np
+import pytest
+from PIL import Image
+
+pytest.importorskip("torch")
+from probmotion.cli.main import main
+
+
+@pytest.fixture
+def asked(monkeypatch, make_result):
+    """Questions to an inference that answers each with a made reconstruction."""
+    questions = []
+
+    def reconstruct(observation, category, *, draws, seed):
+        questions.append((observation, category, draws, seed))
+        return make_result(observation.images)
+
+    module = ModuleType("inference")
+    module.reconstruct = reconstruct
+    monkeypatch.setitem(sys.modules, "probmotion.reconstruction.inference", module)
+    return questions
+
+
+@pytest.fixture
+def files(category, tmp_path):
+    """Folder with a category, two images, their masks and features."""
+    category.save(tmp_path / "dog.npz")
+    inside = np.zeros((40, 60), dtype=np.uint8)
+    inside[10:30, 15:45] = 255
+    for number in range(2):
+        Image.fromarray(np.stack([inside, inside // 2, inside], axis=-1)).save(
+            tmp_path / f"image{number}.png"
+        )
+        Image.fromarray(inside).save(tmp_path / f"mask{number}.png")
+        np.savez(tmp_path / f"features{number}.npz", np.ones((4, 6, 3), dtype=np.float32))
+    return tmp_path
+
+
+def run(files, capsys, *words, category="dog.npz"):
+    """Run the command on files of a folder; return its status and its lines."""
+    words = [*words, "--out", "out", "--category", category]
+    paths = [str(files / word) if word == "out" or "." in word else word for word in words]
+    status = main(["reconstruct", *paths])
+    printed = capsys.readouterr()
+    return status, printed.out + printed.err
+
+
+def test_an_image_is_reconstructed(asked, files, capsys):
+    words = ["image0.png", "--mask", "mask0.png", "--features", "features0.npz", "--fov", "60"]
+    status, text = run(files, capsys, *words, "--draws", "7", "--seed", "3")
+    assert status == 0, text
+    ((observation, category, draws, seed),) = asked
+    assert (observation.images, draws, seed, category.name) == (1, 7, 3, "quadruped")
+    assert observation.features.shape[-1] == 3
+    # The mask is half as wide as the image, and the crop 1.25 times as wide as the mask.
+    assert observation.tangent[0] == pytest.approx(0.625 * np.tan(np.radians(30)), rel=0.02)
+    assert "A body of the category quadruped explains the image." in text
+    assert all((files / "out" / name).exists() for name in ("body.glb", "reconstruct.html"))
+
+
+def test_a_clip_is_reconstructed(asked, files, capsys):
+    words = ["image0.png", "image1.png", "--mask", "mask0.png", "mask1.png"]
+    status, text = run(files, capsys, *words)
+    assert status == 0, text
+    assert asked[0][0].images == 2
+    assert "explains the images." in text
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "image must contain at least one image"),
+        (["image0.png"], "mask must be given, since the image has no transparency"),
+        (["image0.png", "image1.png", "--mask", "mask0.png"], "mask must be a list of 2"),
+        (["image0.png", "--mask", "mask0.png", "mask1.png"], "mask must be a single one"),
+        (["image0.png", "--mask", "no.png"], "no.png"),
+        (["image0.png", "--mask", "mask0.png", "--fov", "150"], "fov must be at most 120"),
+    ],
+)
+def test_errors_are_one_line_and_leave_no_files(asked, files, capsys, words, message):
+    check_failure(files, message, *run(files, capsys, *words))
+    assert asked == []
+
+
+def test_unknown_categories_are_refused(asked, files, capsys):
+    words = ["image0.png", "--mask", "mask0.png"]
+    failure = run(files, capsys, *words, category="cat")
+    check_failure(files, "category must be a file or", *failure)
+
+
+def check_failure(files, message, status, text):
+    assert status == 2
+    assert message in text
+    assert len(text.splitlines()) == 1
+    assert not (files / "out").exists()

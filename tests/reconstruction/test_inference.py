@@ -1,0 +1,116 @@
+"""Modes and draws of reconstructions of made images."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+pytest.importorskip("numba")
+from probmotion.models.images.category import Category
+from probmotion.models.images.made_images import make_images
+from probmotion.models.images.observation import ImageObservation
+from probmotion.models.images.surface_prior import SurfacePrior
+from probmotion.reconstruction import reconstruct
+from probmotion.reconstruction.refinement import Mode, refine
+
+SIZE, TANGENT = 64, np.array([0.15])
+
+
+def observed(made, k: int) -> ImageObservation:
+    return ImageObservation(made.mask[k][None], made.rgb[k][None], None, TANGENT, np.eye(3)[None])
+
+
+@pytest.fixture(scope="module")
+def animal():
+    """The shipped quadruped and made images of it."""
+    category = Category.load("quadruped")
+    prior = SurfacePrior(category, TANGENT)
+    return category, prior, make_images(prior, np.random.default_rng(3), 4, SIZE)
+
+
+def test_refinement_finds_the_pose_again(animal) -> None:
+    """From a start nearby, it reaches at least the density of the truth and is closer to it."""
+    _, prior, images = animal
+    observation, truth = observed(images, 1), images.theta[1]
+    rng = np.random.default_rng(1)
+    start = truth + 0.3 * rng.standard_normal(truth.shape)
+    (mode,) = refine(prior, observation, start[None])
+    density = prior.log_likelihood(truth[None], observation) + prior.log_density(truth)
+    reached = prior.log_likelihood(mode.theta[None], observation)
+    assert reached[0] + prior.log_density(mode.theta) >= density[0]
+
+    def distance(theta: np.ndarray) -> float:
+        joints = prior.motion(np.stack([theta, truth]))[:, 0]
+        middle = joints.mean(axis=1, keepdims=True)
+        return float(np.linalg.norm(np.diff(joints - middle, axis=0), axis=-1).mean())
+
+    assert distance(mode.theta) < 0.7 * distance(start)
+
+
+def test_draws_of_a_mode_have_its_moments() -> None:
+    rng = np.random.default_rng(0)
+    factor = rng.standard_normal((3, 3))
+    precision = factor @ factor.T + np.eye(3)
+    mode = Mode(np.arange(3.0), -2.0, precision)
+    draws = mode.draw(rng, 200_000)
+    np.testing.assert_allclose(draws.mean(axis=0), mode.theta, atol=0.01)
+    np.testing.assert_allclose(np.cov(draws.T), np.linalg.inv(precision), atol=0.01)
+    volume = np.sqrt((2 * np.pi) ** 3 / np.linalg.det(precision))
+    assert mode.log_evidence == pytest.approx(-2.0 + np.log(volume))
+
+
+def test_reconstruction_covers_the_mask_and_is_near_the_truth(animal) -> None:
+    category, prior, made = animal
+    result = reconstruct(observed(made, 0), category, draws=20, seed=1)
+    assert result.mask_iou > 0.75
+    assert result.trusted
+    truth = prior.motion(made.theta[:1])[0, 0]
+    middle = truth - truth.mean(axis=0)
+    joints = result.joints - result.joints.mean(axis=1, keepdims=True)
+    error = np.linalg.norm(joints.mean(axis=0) - middle, axis=-1).mean()
+    turned = np.linalg.norm(joints.mean(axis=0) * [-1, 1, -1] - middle, axis=-1).mean()
+    assert error < 0.5 * turned
+
+
+def test_a_silhouette_of_something_else_is_not_trusted(animal) -> None:
+    """A ring is no animal."""
+    category, _, _ = animal
+    place = 2 * (np.arange(SIZE) + 0.5) / SIZE - 1
+    radius = np.hypot(place, place[:, None])
+    mask = ((radius > 0.5) & (radius < 0.8)).astype(float)
+    ring = ImageObservation(mask[None], None, None, TANGENT, np.eye(3)[None])
+    result = reconstruct(ring, category, draws=2)
+    assert not result.trusted
+    assert "silhouette" in result.summary()[0]
+
+
+@pytest.mark.slow
+def test_draws_are_reproducible(animal) -> None:
+    category, _, made = animal
+    one, other = (reconstruct(observed(made, 0), category, draws=3, seed=1) for _ in range(2))
+    np.testing.assert_array_equal(one.draws, other.draws)
+
+
+@pytest.mark.slow
+def test_a_clip_is_reconstructed_as_one_motion(animal) -> None:
+    category, _, _ = animal
+    clip = SurfacePrior(category, np.repeat(TANGENT, 2))
+    theta = make_images(SurfacePrior(category, TANGENT), np.random.default_rng(5), 1, SIZE).theta
+    theta = np.concatenate([theta, np.zeros((1, clip.dim - theta.shape[1]))], axis=1)
+    import torch
+
+    with torch.no_grad():
+        images = clip.render(torch.as_tensor(theta), SIZE)[0].numpy()
+    rotation = np.tile(np.eye(3), (2, 1, 1))
+    mask = (images[..., 3] > 0.5).astype(float)
+    observation = ImageObservation(mask, None, None, clip.tangent, rotation)
+    result = reconstruct(observation, category, draws=2)
+    assert result.draws.shape == (2, clip.dim)
+    assert result.mask_iou > 0.7
+
+
+def test_draws_must_be_at_least_two(animal) -> None:
+    category, _, made = animal
+    with pytest.raises(ValueError, match="draws"):
+        reconstruct(observed(made, 0), category, draws=1)
