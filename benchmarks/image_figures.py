@@ -78,8 +78,9 @@ def scaled(joints: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Return joints (…, J, 3) relative to their middle, in the size of the truth (J, 3)."""
     joints = joints - joints.mean(axis=-2, keepdims=True)
     truth = truth - truth.mean(axis=0)
-    size = (joints * truth).sum(axis=(-1, -2)) / (joints**2).sum(axis=(-1, -2))
-    return np.asarray(np.maximum(size, 0.1)[..., None, None] * joints)
+    # The ratio of sizes: that of least squares would shrink bodies that face elsewhere.
+    size = np.sqrt((truth**2).sum() / (joints**2).sum(axis=(-1, -2)))
+    return np.asarray(size[..., None, None] * joints)
 
 
 def measured(examples: Examples, suffix: str = "", **changes: Any) -> Figures:

@@ -19,7 +19,7 @@ from probmotion.validation import check_count
 
 __all__ = ["encoded", "mixture_draws", "posterior_modes", "reconstruct"]
 
-_STARTS, _KEPT = 8, 3  # draws from the encoder that are refined, and modes refined to the end
+_STARTS, _KEPT = 6, 3  # draws from the encoder that are refined, and modes refined to the end
 _UNLIKELY = 0.02  # probability of a quarter turn below which its mean is not refined
 _UNCOVERED = 0.25
 """Largest 1 − IoU of silhouette and mask of reconstructions that can be trusted."""

@@ -22,6 +22,7 @@ from probmotion.reconstruction.moving_surface import albedos, surface_frames
 __all__ = ["reconstruction_page"]
 
 _IMAGES = 4  # most images of a clip
+_HALF = 0.55  # half of the image, of the larger side of the body in views from other sides
 _VIEWS, _VIEW_SIZE = 6, 192  # views from around the body, and their pixels
 _UNITS = 32000  # of 16-bit integers, for the largest coordinate
 _STYLE = """
@@ -122,12 +123,24 @@ def _views(prior: SurfacePrior, theta: np.ndarray) -> str:
     figures = []
     for turn in range(_VIEWS):
         turned = prior.facing(theta, yaw + turn * 2 * np.pi / _VIEWS)
-        image = _rendered(prior, turned, _VIEW_SIZE)[0]
+        image = _rendered(prior, _framed(prior, turned) if turn else theta, _VIEW_SIZE)[0]
         covered = np.clip(image[..., 3:], 0.0, 1.0)
         colours = image[..., :3] / np.maximum(covered, 1e-3)
         name = f"turned by {turn * 360 // _VIEWS}°" if turn else "as in the image"
         figures.append(_figure(_png(np.concatenate([colours, covered], axis=-1)), name))
     return "".join(figures)
+
+
+def _framed(prior: SurfacePrior, theta: np.ndarray) -> np.ndarray:
+    """Return θ (dim,) with the body moved into the middle of the first image, as large as fits."""
+    for _ in range(2):  # its perspective changes a little
+        with torch.no_grad():
+            vertices = prior.vertices(torch.as_tensor(theta[None]))[0, 0].numpy()
+        points = vertices[:, :2] / (vertices[:, 2:] * prior.tangent[0])
+        low, high = points.min(axis=0), points.max(axis=0)
+        half = np.array([_HALF * (high - low).max()])
+        theta = prior.moved(theta[None], -0.5 * (low + high)[None], half)[0]
+    return theta
 
 
 def _surface(prior: SurfacePrior, shown: Mapping[str, np.ndarray]) -> str:

@@ -26,7 +26,7 @@ _DAMPING = (0.03, 0.3, 3.0, 30.0)  # tried in every step, relative to the diagon
 _LONGEST = 4.0  # longest step of θ
 _SMALLEST_GAIN = 0.1  # of log density; below, a stage ends
 _ROWS = 48  # number of θ rendered at once
-_BELIEVED = 0.0025
+_BELIEVED = 0.005
 """Share of the information of the images in the spread of draws: their errors are larger than the
 curvature at a mode says, because the likelihood is rugged. Chosen on validation images, such that
 intervals of 90 % hold."""
