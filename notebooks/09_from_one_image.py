@@ -155,7 +155,7 @@ pd.Series(compared(result, truth)).round(2)
 # From the front, an animal has nearly the same silhouette as from behind, and its mirror image is as probable. Another
 # image shows this: below, draws given its mask alone, seen by the camera and from above, where it did not look; and draws
 # given its colours, too. The truth, in black, faces away from the camera. Shading helps with the direction, but not
-# always: the guide to `probmotion reconstruct` has the errors of many images.
+# always, and left and right remain open here: the guide to `probmotion reconstruct` has the errors of many images.
 
 # %%
 other = make_images(prior, np.random.default_rng(21), 1, 128)
@@ -193,8 +193,8 @@ pd.DataFrame({name: compared(each, other_truth) for name, each in results.items(
 # %% [markdown]
 # ## 5. Another sampler
 #
-# Some draws above would be seen from the side, and the mask excludes this: Gaussians about modes are wider than the
-# posterior. An image is an observation like any other, and `pm.posterior(prior, observation)` is the same posterior for
+# The draws above are from Gaussians about modes that are wider than the posterior: they count .5 % of the image's
+# information. An image is an observation like any other, and `pm.posterior(prior, observation)` is the posterior for
 # every sampler of densities. Metropolis-Hastings starts at the draws and needs no approximation. Its chains are short and
 # rarely move from one direction to another: they say how wide the modes are, not how probable.
 

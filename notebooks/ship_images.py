@@ -43,8 +43,8 @@ A {name} in one image, for `probmotion reconstruct`: the surface of its skeleton
 encoder of {parameters:.1f} million weights.
 
 - **Motions**: {windows} windows of {frames} frames at {fps:g} frames per second, of {clips};
-  {dim} principal components of bone rotations. Bone rotations reproduce the joints to
-  {error:.1f} mm. Draws move at {speed:.2f} times the speed of the windows.
+  {dim} principal components of bone rotations, which reproduce the joints to {error:.1f} mm before
+  the reduction. Draws move at {speed:.2f} times the speed of the windows.
 - **Provenance**: {provenance}
 - **Surface, shapes and colours**: not learnt; `Category.of_capsules`. `probmotion train images`
   learns them from clips of images.

@@ -33,10 +33,10 @@ class TurnFit(NamedTuple):
 
 
 def fit_turns(body: ArticulatedBody, positions: np.ndarray) -> TurnFit:
-    """Fit small bone rotations within the joint ranges to motions (N, L, J, 3), metres, Y up.
+    """Fit small bone rotations, softly limited by the joint ranges, to motions.
 
-    Bone lengths are constant in each motion. Adam with a falling learning rate, from the rest pose
-    facing in the direction of the body's left side.
+    Bone lengths are constant in each motion (N, L, J, 3), metres, Y up. Adam with a falling
+    learning rate, from the rest pose facing as the body's left side implies.
     """
     check_shape("positions", positions, ("N", "L", body.skeleton.n_joints, 3))
     check_finite("positions", positions)

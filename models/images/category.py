@@ -147,7 +147,7 @@ class Category:
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of all arrays, in hexadecimal."""
+        """SHA-256 of the arrays of rest pose, vertices, shapes, colours and code, hexadecimal."""
         code = (self.code.mean, self.code.basis) if isinstance(self.code, TurnCode) else ()
         arrays = (self.body.rest, self.surface.vertices, self.shapes, self.albedo, self.albedos)
         content = hashlib.sha256()
@@ -195,7 +195,7 @@ class Category:
         """
         path = Path(source)
         shipped = _WEIGHTS / f"{source}-images.npz"
-        path = shipped if not path.exists() and shipped.exists() else path
+        path = shipped if not path.is_file() and shipped.is_file() else path
         if not path.is_file():
             names = sorted(
                 p.name.removesuffix("-images.npz") for p in _WEIGHTS.glob("*-images.npz")

@@ -29,10 +29,11 @@ from probmotion.models.training.checkpoints import (
     valid_settings,
 )
 
-__all__ = ["KIND", "EncoderTrainee", "encoder_of", "load_encoder", "mixture_loss"]
+__all__ = ["KIND", "TANGENTS", "EncoderTrainee", "encoder_of", "load_encoder", "mixture_loss"]
 
 KIND = "image-encoder"
-_TANGENTS = (0.05, 0.35)  # of the crops' half fields of view
+TANGENTS = (0.05, 0.35)
+"""Range of the tangents of half the crops' fields of view."""
 _GREY = 0.2  # share of inputs without colours
 _VALIDATED = 256
 
@@ -82,7 +83,7 @@ class EncoderTrainee:
         return SurfacePrior(self.category, np.ones(1)).layout.view.start
 
     def _batch(self, rng: np.random.Generator, n: int) -> tuple[torch.Tensor, np.ndarray]:
-        tangent = np.exp(rng.uniform(*np.log(_TANGENTS)))
+        tangent = np.exp(rng.uniform(*np.log(TANGENTS)))
         made = make_images(SurfacePrior(self.category, np.array([tangent])), rng, n, SIZE)
         images = encoder_input(made.mask, made.rgb)
         grey = torch.as_tensor(rng.random(n) < _GREY)

@@ -160,6 +160,15 @@ class SurfacePrior(StandardNormalPrior):
             images.append(image)
         return torch.stack(images, dim=1)
 
+    def check_observations(self, likelihood: ImageObservation) -> None:
+        """Raise ``ValueError`` if the images are not those of the prior's cameras."""
+        tangent = getattr(likelihood, "tangent", None)
+        if tangent is None or not np.array_equal(tangent, self.tangent):
+            raise ValueError(
+                f"likelihood must be of images with the prior's tangent, {self.tangent}, got "
+                f"{tangent}"
+            )
+
     def log_likelihood(self, theta: Array, likelihood: ImageObservation) -> Array:
         """Return log p(images | θ) but for a constant: ``(…, dim) → (…)``."""
         check_shape("theta", theta, ("…", self.dim))

@@ -1,7 +1,7 @@
 """`TurnCode`: Gaussian distribution of an articulated body's bone rotations over a few frames.
 
 One code z ~ N(0, I) determines the whole motion, as in *Ponymation* (section 3.1); the decoder is
-linear. Its draws move at the speed of the motions that it was learnt from.
+linear. Its draws move at about the speed of the motions that it was learnt from.
 """
 
 from __future__ import annotations

@@ -174,7 +174,8 @@ class Reconstruct:
     """Mask of the body, one for each image; the image's opacity by default."""
 
     features: tuple[Path, ...] = ()
-    """Image features (.npz, one array of rows, columns and channels), one file for each image."""
+    """Image features (.npz, one array of rows, columns and channels), one file for each image. They
+    are read and checked, but not used yet."""
 
     category: str
     """Kind of body: quadruped, person, or the file of a trained category."""

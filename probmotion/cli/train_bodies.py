@@ -246,13 +246,15 @@ class TrainImages:
             images, _ = make_clips(animal, rng, count, _FRAMES, _SIZE)
             return images[: self.images]
         clips = [_masked_images(folder) for folder in self.clips]
-        most = -(-self.images // len(clips))
         images = []
-        for clip in clips:
-            chosen = np.unique(np.linspace(0, len(clip) - 1, most).round().astype(int))
+        for number, clip in enumerate(clips):
+            share = (self.images + len(clips) - 1 - number) // len(clips)
+            if not share:
+                continue
+            chosen = np.unique(np.linspace(0, len(clip) - 1, share).round().astype(int))
             for image, mask in (clip[k] for k in chosen):
                 images.append(ImageObservation.read(image, mask, fov=self.fov, size=_SIZE))
-        return images[: self.images]
+        return images
 
     def _start_encoder(self, start: Category, settings: TrainingSettings) -> EncoderNetwork:
         """Return the encoder beside the category's file, or else train one."""
@@ -276,10 +278,12 @@ def _masked_images(folder: Path) -> list[tuple[Path, Path]]:
     """Return the images of a clip and their masks, sorted by name."""
     found: dict[str, dict[str, Path]] = {}
     for part in ("images", "masks"):
-        suffixes = {".png", ".jpg"} if part == "images" else {".png"}
+        suffixes = {".png", ".jpg", ".jpeg"} if part == "images" else {".png"}
         if not (folder / part).is_dir():
             raise ValueError(f"clips must be folders with images and masks, got no {folder / part}")
-        files = [path for path in sorted((folder / part).iterdir()) if path.suffix in suffixes]
+        files = [
+            path for path in sorted((folder / part).iterdir()) if path.suffix.lower() in suffixes
+        ]
         found[part] = {path.stem: path for path in files}
         if not files:
             raise ValueError(

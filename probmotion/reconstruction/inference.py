@@ -10,7 +10,7 @@ from probmotion.extras import torch
 from probmotion.lifting.checks import Check
 from probmotion.models.images.category import Category
 from probmotion.models.images.encoder import EncoderNetwork, encoder_input
-from probmotion.models.images.encoder_training import encoder_of
+from probmotion.models.images.encoder_training import TANGENTS, encoder_of
 from probmotion.models.images.observation import ImageObservation
 from probmotion.models.images.surface_prior import SurfacePrior
 from probmotion.reconstruction.refinement import Mode, refine
@@ -31,8 +31,10 @@ def reconstruct(
     """Reconstruct a body of a category in 3D from one image, or from the images of a clip.
 
     The encoder's hypotheses of pose, shape and direction are refined to modes of the posterior;
-    draws are those of a mixture of Gaussians at the modes, weighted by their evidence (Laplace
-    approximation). Images of a clip follow each other at the frame rate of the category's motions.
+    draws are those of a mixture of Gaussians at the modes, weighted by their evidence. The
+    Gaussians are wider than the Laplace approximation, such that intervals hold in spite of the
+    likelihood's many narrow modes. Images of a clip follow each other at the frame rate of the
+    category's motions.
 
     Parameters
     ----------
@@ -59,11 +61,17 @@ def reconstruct(
     result = Reconstruction(observation, prior, modes[0].theta, chosen, ())
     return result.with_checks(
         Check(
+            "field of view",
+            float(observation.tangent.max()),
+            TANGENTS[1],
+            "the body fills more of the field of view than those that the encoder was trained on",
+        ),
+        Check(
             "silhouette",
             1 - result.mask_iou,
             _UNCOVERED,
             f"no body of the category {category.name} has this silhouette",
-        )
+        ),
     )
 
 
@@ -105,7 +113,7 @@ def encoded(
 
 
 def mixture_draws(modes: list[Mode], rng: np.random.Generator, n: int) -> np.ndarray:
-    """Return ``n`` draws (n, dim) of the mixture of Laplace approximations at the modes."""
+    """Return ``n`` draws (n, dim) of the mixture of Gaussians at the modes."""
     weights = softmax([mode.log_evidence for mode in modes])
     counts = rng.multinomial(n, weights)
     parts = [mode.draw(rng, int(k)) for mode, k in zip(modes, counts, strict=True)]

@@ -1,4 +1,4 @@
-"""Modes of the posterior of images by Gauss-Newton steps, and its Laplace approximation.
+"""Modes of the posterior of images by Gauss-Newton steps, and Gaussians around them.
 
 Derivatives of images are finite differences: rendering a batch costs less than automatic
 differentiation of every pixel, and differences see silhouettes beyond one pixel.
@@ -25,6 +25,8 @@ _DIFFERENCE = 0.05  # of θ, whose prior has standard deviation 1
 _DAMPING = (0.03, 0.3, 3.0, 30.0)  # tried in every step, relative to the diagonal
 _LONGEST = 4.0  # longest step of θ
 _SMALLEST_GAIN = 0.1  # of log density; below, a stage ends
+_FIXED = 100.0  # precision of what has no meaning
+_SAME = 0.1  # squared distance of two modes per coordinate below which they are the same
 _ROWS = 48  # number of θ rendered at once
 _BELIEVED = 0.005
 """Share of the information of the images in the spread of draws: their errors are larger than the
@@ -33,7 +35,11 @@ intervals of 90 % hold."""
 
 
 class Mode(NamedTuple):
-    """Maximum θ̂ (dim,) of a posterior, its log density, and the precision (dim, dim) of draws."""
+    """Maximum θ̂ (dim,) of a posterior, its log density, and the precision (dim, dim) of draws.
+
+    The precision is that of the prior and of a share of the information of the images: draws are
+    wider than the Laplace approximation.
+    """
 
     theta: np.ndarray
     log_density: float
@@ -41,7 +47,7 @@ class Mode(NamedTuple):
 
     @property
     def log_evidence(self) -> float:
-        """Log of the integral of the Laplace approximation."""
+        """Log of the integral of a Gaussian of the mode's height and precision."""
         dim = len(self.theta)
         return float(
             self.log_density
@@ -50,7 +56,7 @@ class Mode(NamedTuple):
         )
 
     def draw(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """Return n draws of the Laplace approximation, (n, dim)."""
+        """Return n draws of the Gaussian, (n, dim)."""
         lower = np.linalg.cholesky(self.precision)
         noise = rng.standard_normal((n, len(self.theta)))
         return self.theta + np.linalg.solve(lower.T, noise.T).T
@@ -74,14 +80,36 @@ def refine(
         if number == 0 and keep is not None:
             reached = _diverse(prior, reached)[:keep]
         points = [point for point, _ in reached]
+    start = prior.layout.view.start
     for point, value in reached:
+        # The length of the two coordinates of the direction does not matter: draws keep it, or
+        # they would cross the origin and face the other way.
+        pair = point[start : start + 2].double()
+        turned = prior.facing(point.numpy(), math.atan2(float(pair[0]), float(pair[1])))
+        value += 0.5 * float((pair**2).sum()) - 1.0
+        point = torch.as_tensor(turned, dtype=torch.float32)
         images = _images(prior, point[None], likelihood.size)
         _, information = likelihood.curvature(
             images[0], _derivatives(prior, point, images[0], likelihood.size)
         )
         precision = _BELIEVED * information.double().numpy() + np.eye(len(point))
+        radial = np.zeros(len(point))
+        radial[start : start + 2] = turned[start : start + 2] / math.sqrt(2)
+        precision += _FIXED * np.outer(radial, radial)
         modes.append(Mode(point.double().numpy(), value, precision))
-    return modes
+    modes.sort(key=lambda mode: -mode.log_density)
+    return _distinct(modes)
+
+
+def _distinct(modes: list[Mode]) -> list[Mode]:
+    """Return the modes without those that another start has reached, too."""
+    found: list[Mode] = []
+    for mode in modes:
+        apart = [mode.theta - other.theta for other in found]
+        distances = [d @ other.precision @ d for d, other in zip(apart, found, strict=True)]
+        if all(distance > _SAME * len(mode.theta) for distance in distances):
+            found.append(mode)
+    return found
 
 
 def _diverse(

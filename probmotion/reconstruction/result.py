@@ -124,7 +124,7 @@ class Reconstruction:
         if failed:
             trust = f"Do not trust this reconstruction: {'; '.join(failed)}."
         if self.observation.truncated.any():
-            trust += " A part of the body is beyond the border."
+            trust += " A part of the body is beyond the border or hidden."
         precision = (
             f"The most probable body covers the mask with an intersection over union of "
             f"{self.mask_iou:.2f}, and joints have a standard deviation of "

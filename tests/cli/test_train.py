@@ -182,7 +182,7 @@ def test_invalid_options_give_one_error_line_and_no_files(walks, tmp_path, monke
         assert expected in fails(*base, *options.split()), options
         assert not out.exists()
     for args, got in {("train",): "none", ("train", "vae"): "'vae'"}.items():
-        assert fails(*args) == f"kind must be one of {', '.join(KINDS)}, got {got}"
+        assert fails(*args) == f"kind must be one of {', '.join(KINDS)}, images, got {got}"
 
 
 @pytest.mark.parametrize(

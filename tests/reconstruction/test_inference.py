@@ -46,6 +46,9 @@ def test_refinement_finds_the_pose_again(animal) -> None:
         return float(np.linalg.norm(np.diff(joints - middle, axis=0), axis=-1).mean())
 
     assert distance(mode.theta) < 0.7 * distance(start)
+    place = slice(prior.layout.view.start, prior.layout.view.start + 2)
+    facing = mode.draw(rng, 400)[:, place] @ mode.theta[place]
+    assert (facing < 0).mean() < 0.01
 
 
 def test_draws_of_a_mode_have_its_moments() -> None:
