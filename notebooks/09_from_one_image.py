@@ -27,7 +27,6 @@
 # On Colab, first run `%pip install 'probmotion[all] @ git+https://github.com/probmotion/probmotion'`.
 
 # %%
-
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd

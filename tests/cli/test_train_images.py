@@ -119,7 +119,8 @@ def test_wrong_folders_give_one_error_line_and_no_files(start, tmp_path, fails):
     (tmp_path / "empty").mkdir()
     cases["empty"] = f"clips must be folders with images and masks, got no {tmp_path}/empty/images"
     (tmp_path / "blank" / "images").mkdir(parents=True)
-    cases["blank"] = f"clips must contain .jpg or .png, got none in {tmp_path}/blank/images"
+    blank = tmp_path / "blank" / "images"
+    cases["blank"] = f"clips must contain .jpeg or .jpg or .png, got none in {blank}"
     unmasked = write_clip(tmp_path / "unmasked")
     for mask in (unmasked / "masks").iterdir():
         mask.unlink()
