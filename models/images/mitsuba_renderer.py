@@ -68,23 +68,7 @@ class MitsubaRenderer:
         tangent: float,
         size: int,
     ) -> torch.Tensor:
-        """Return images (B, size, size, 4): colours times coverage, and coverage.
-
-        Differentiable with respect to vertices and colours.
-
-        Parameters
-        ----------
-        vertices : Tensor, (B, V, 3)
-            Camera coordinates of a closed mesh, metres: x right, y down, z forward.
-        triangles : ndarray, (T, 3)
-            Vertices of each triangle, counterclockwise from outside.
-        colours : Tensor, (B, V, 3)
-            Radiance of each vertex.
-        tangent : float
-            Tangent of half the field of view.
-        size : int
-            Width and height of the images, pixels.
-        """
+        """Return images (B, size, size, 4), as ``Renderer.render`` of the rasteriser's module."""
         check_shape("vertices", vertices, ("B", "V", 3))
         check_finite("vertices", vertices.detach())
         check_shape("colours", colours, tuple(vertices.shape))

@@ -34,24 +34,9 @@ class Renderer(Protocol):
         tangent: float,
         size: int,
     ) -> torch.Tensor:
-        """Return images (B, size, size, 4), as :meth:`Rasterizer.render` does."""
-
-
-class Rasterizer:
-    """Renderer on the processor, exact to a fraction of a pixel and deterministic."""
-
-    def render(
-        self,
-        vertices: torch.Tensor,
-        triangles: np.ndarray,
-        colours: torch.Tensor,
-        tangent: float,
-        size: int,
-    ) -> torch.Tensor:
         """Return images (B, size, size, 4): colours times coverage, and coverage.
 
-        Differentiable with respect to vertices and colours. Triangles with a vertex behind the
-        camera are not drawn.
+        Differentiable with respect to vertices and colours.
 
         Parameters
         ----------
@@ -65,6 +50,23 @@ class Rasterizer:
             Tangent of half the field of view.
         size : int
             Width and height of the images, pixels.
+        """
+
+
+class Rasterizer:
+    """Renderer on the processor, exact to a fraction of a pixel and deterministic."""
+
+    def render(
+        self,
+        vertices: torch.Tensor,
+        triangles: np.ndarray,
+        colours: torch.Tensor,
+        tangent: float,
+        size: int,
+    ) -> torch.Tensor:
+        """Return images (B, size, size, 4), as :meth:`Renderer.render`.
+
+        Triangles with a vertex behind the camera are not drawn.
         """
         check_shape("vertices", vertices, ("B", "V", 3))
         check_shape("colours", colours, tuple(vertices.shape))
@@ -96,23 +98,20 @@ class _Rasterize(torch.autograd.Function):
         edges = _edges(triangles)
         plain, faces, nearness = _visible(*inputs, triangles, size)
         image = plain.copy()
-        _blend(image, plain, nearness, *inputs, triangles, edges, tolerance)
-        context.state = (*inputs, triangles, edges, plain, faces, nearness, tolerance)
+        crossings = _crossings(nearness, *inputs[:2], triangles, edges, tolerance)
+        _blend(image, plain, *inputs[1:], edges, *crossings)
+        context.state = (*inputs, triangles, edges, plain, faces, *crossings)
         context.dtype = screen.dtype
         return torch.from_numpy(image).to(screen.dtype)
 
     @staticmethod
     def backward(context: Any, *gradients: torch.Tensor) -> Any:
-        screen, inverse, colours, triangles, edges, plain, faces, nearness, tolerance = (
-            context.state
-        )
+        screen, inverse, colours, triangles, edges, plain, faces, *crossings = context.state
         gradient = np.ascontiguousarray(gradients[0].detach().double().numpy())
         inputs = screen, inverse, colours
         parts = [np.zeros_like(part) for part in inputs]
         of_plain = gradient.copy()
-        _blend_back(
-            gradient, of_plain, *parts, plain, nearness, *inputs, triangles, edges, tolerance
-        )
+        _blend_back(gradient, of_plain, *parts, plain, *inputs, edges, *crossings)
         _visible_back(of_plain, *parts, *inputs, triangles, faces)
         tensors = [torch.from_numpy(part).to(context.dtype) for part in parts]
         return (*tensors, None, None, None)
@@ -307,56 +306,92 @@ def _crossing(
 
 
 @numba.njit(cache=True)
-def _blend(
-    image: np.ndarray,
-    plain: np.ndarray,
+def _lines(p: np.ndarray, q: np.ndarray, axis: int, size: int) -> tuple[int, int]:
+    """Return the first row (``axis`` 0) or column whose centre an edge crosses, and the end."""
+    low, high = min(p[1 - axis], q[1 - axis]), max(p[1 - axis], q[1 - axis])
+    first, end = int(np.ceil(max(low, 0.0) - 0.5)), int(np.ceil(min(high, size) - 0.5))
+    return max(first, 0), min(end, size)
+
+
+@numba.njit(cache=True)
+def _crossings(
     nearness: np.ndarray,
     screen: np.ndarray,
     inverse: np.ndarray,
-    colours: np.ndarray,
     triangles: np.ndarray,
     edges: np.ndarray,
     tolerance: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return where visible silhouettes pass between neighbouring pixels.
+
+    Of each of N crossings: image, edge, axis, row and column of the pixel inside and of the one
+    outside, (N, 7); the distance t from the former, the fraction s of the edge, and the share of
+    rows or columns in the blending of this edge, (N, 3).
+    """
+    size = nearness.shape[1]
+    most = 0
+    for i in range(len(screen)):
+        for e in range(len(edges)):
+            if _silhouette(screen[i], inverse[i], triangles, edges[e]) >= 0:
+                for axis in range(2):
+                    first, end = _lines(screen[i, edges[e, 0]], screen[i, edges[e, 1]], axis, size)
+                    most += max(end - first, 0)
+    places, values = np.empty((most, 7), dtype=np.int64), np.empty((most, 3))
+    count = 0
+    for i in range(len(screen)):
+        for e in range(len(edges)):
+            inside = _silhouette(screen[i], inverse[i], triangles, edges[e])
+            if inside < 0:
+                continue
+            p, q = screen[i, edges[e, 0]], screen[i, edges[e, 1]]
+            length = (q[0] - p[0]) ** 2 + (q[1] - p[1]) ** 2
+            for axis in range(2):
+                first, end = _lines(p, q, axis, size)
+                for line in range(first, end):
+                    inner, outer, t, s = _crossing(
+                        nearness[i], screen[i], inverse[i], edges[e], inside, axis, line, tolerance
+                    )
+                    if t < 0:
+                        continue
+                    places[count, 0], places[count, 1], places[count, 2] = i, e, axis
+                    places[count, 3 + axis], places[count, 4 - axis] = line, inner
+                    places[count, 5 + axis], places[count, 6 - axis] = line, outer
+                    values[count, 0], values[count, 1] = t, s
+                    values[count, 2] = (q[1 - axis] - p[1 - axis]) ** 2 / length
+                    count += 1
+    return places[:count], values[:count]
+
+
+@numba.njit(cache=True)
+def _blend(
+    image: np.ndarray,
+    plain: np.ndarray,
+    inverse: np.ndarray,
+    colours: np.ndarray,
+    edges: np.ndarray,
+    places: np.ndarray,
+    values: np.ndarray,
 ) -> None:
     """Blend the pixels on either side of visible silhouettes.
 
     An edge in the inner half covers part of the pixel inside, in the outer half part of the one
     outside, with the colour of the edge.
     """
-    size = image.shape[1]
-    for i in range(len(image)):
-        for e in range(len(edges)):
-            edge = edges[e]
-            inside = _silhouette(screen[i], inverse[i], triangles, edge)
-            if inside < 0:
+    for n in range(len(places)):
+        i, e, _, y, x, v, u = places[n]
+        t, s, share = values[n]
+        one, two = edges[e, 0], edges[e, 1]
+        near0, near1 = (1 - s) * inverse[i, one], s * inverse[i, two]
+        for k in range(4):
+            if t < 0.5:
+                change = plain[i, v, u, k] - plain[i, y, x, k]
+                image[i, y, x, k] += share * (0.5 - t) * change
                 continue
-            p, q = screen[i, edge[0]], screen[i, edge[1]]
-            length = (q[0] - p[0]) ** 2 + (q[1] - p[1]) ** 2
-            for axis in range(2):
-                share = (q[1 - axis] - p[1 - axis]) ** 2 / length if length > 0 else 0.0
-                low, high = min(p[1 - axis], q[1 - axis]), max(p[1 - axis], q[1 - axis])
-                start, stop = int(np.ceil(max(low, 0.0) - 0.5)), int(np.ceil(min(high, size) - 0.5))
-                for line in range(max(start, 0), min(stop, size)):
-                    inner, outer, t, s = _crossing(
-                        nearness[i], screen[i], inverse[i], edge, inside, axis, line, tolerance
-                    )
-                    if t < 0:
-                        continue
-                    y, x, v, u = (
-                        (line, inner, line, outer) if axis == 0 else (inner, line, outer, line)
-                    )
-                    near0 = (1 - s) * inverse[i, edge[0]]
-                    near1 = s * inverse[i, edge[1]]
-                    for k in range(4):
-                        if t < 0.5:
-                            change = plain[i, v, u, k] - plain[i, y, x, k]
-                            image[i, y, x, k] += share * (0.5 - t) * change
-                            continue
-                        colour = 1.0
-                        if k < 3:
-                            colour = near0 * colours[i, edge[0], k] + near1 * colours[i, edge[1], k]
-                            colour /= near0 + near1
-                        image[i, v, u, k] += share * (t - 0.5) * (colour - plain[i, v, u, k])
+            colour = 1.0
+            if k < 3:
+                colour = near0 * colours[i, one, k] + near1 * colours[i, two, k]
+                colour /= near0 + near1
+            image[i, v, u, k] += share * (t - 0.5) * (colour - plain[i, v, u, k])
 
 
 @numba.njit(cache=True)
@@ -367,79 +402,55 @@ def _blend_back(
     of_inverse: np.ndarray,
     of_colours: np.ndarray,
     plain: np.ndarray,
-    nearness: np.ndarray,
     screen: np.ndarray,
     inverse: np.ndarray,
     colours: np.ndarray,
-    triangles: np.ndarray,
     edges: np.ndarray,
-    tolerance: float,
+    places: np.ndarray,
+    values: np.ndarray,
 ) -> None:
     """Add the gradients of :func:`_blend` with respect to unblended pixels and vertices."""
-    size = gradient.shape[1]
-    for i in range(len(gradient)):
-        for e in range(len(edges)):
-            edge = edges[e]
-            inside = _silhouette(screen[i], inverse[i], triangles, edge)
-            if inside < 0:
+    for n in range(len(places)):
+        i, e, axis, y, x, v, u = places[n]
+        t, s, share = values[n]
+        one, two = edges[e, 0], edges[e, 1]
+        p, q = screen[i, one], screen[i, two]
+        along, rise = q[axis] - p[axis], q[1 - axis] - p[1 - axis]
+        length = along**2 + rise**2
+        of_t, of_s, of_share = 0.0, 0.0, 0.0
+        near0, near1 = (1 - s) * inverse[i, one], s * inverse[i, two]
+        near = near0 + near1
+        for k in range(4):
+            if t < 0.5:
+                g = gradient[i, y, x, k]
+                change = plain[i, v, u, k] - plain[i, y, x, k]
+                of_t -= g * share * change
+                of_share += g * (0.5 - t) * change
+                of_plain[i, v, u, k] += g * share * (0.5 - t)
+                of_plain[i, y, x, k] -= g * share * (0.5 - t)
                 continue
-            one, two = edge[0], edge[1]
-            p, q = screen[i, one], screen[i, two]
-            length = (q[0] - p[0]) ** 2 + (q[1] - p[1]) ** 2
-            for axis in range(2):
-                along, rise = q[axis] - p[axis], q[1 - axis] - p[1 - axis]
-                share = rise**2 / length if length > 0 else 0.0
-                low, high = min(p[1 - axis], q[1 - axis]), max(p[1 - axis], q[1 - axis])
-                start, stop = int(np.ceil(max(low, 0.0) - 0.5)), int(np.ceil(min(high, size) - 0.5))
-                for line in range(max(start, 0), min(stop, size)):
-                    inner, outer, t, s = _crossing(
-                        nearness[i], screen[i], inverse[i], edge, inside, axis, line, tolerance
-                    )
-                    if t < 0:
-                        continue
-                    y, x, v, u = (
-                        (line, inner, line, outer) if axis == 0 else (inner, line, outer, line)
-                    )
-                    of_t, of_s, of_share = 0.0, 0.0, 0.0
-                    near0, near1 = (1 - s) * inverse[i, one], s * inverse[i, two]
-                    near = near0 + near1
-                    for k in range(4):
-                        if t < 0.5:
-                            g = gradient[i, y, x, k]
-                            change = plain[i, v, u, k] - plain[i, y, x, k]
-                            of_t -= g * share * change
-                            of_share += g * (0.5 - t) * change
-                            of_plain[i, v, u, k] += g * share * (0.5 - t)
-                            of_plain[i, y, x, k] -= g * share * (0.5 - t)
-                            continue
-                        g = gradient[i, v, u, k]
-                        colour = 1.0
-                        if k < 3:
-                            c0, c1 = colours[i, one, k], colours[i, two, k]
-                            colour = (near0 * c0 + near1 * c1) / near
-                            factor = g * share * (t - 0.5)
-                            of_colours[i, one, k] += factor * near0 / near
-                            of_colours[i, two, k] += factor * near1 / near
-                            of_inverse[i, one] += factor * (1 - s) * (c0 - colour) / near
-                            of_inverse[i, two] += factor * s * (c1 - colour) / near
-                            of_s += (
-                                factor
-                                * (
-                                    inverse[i, two] * (c1 - colour)
-                                    - inverse[i, one] * (c0 - colour)
-                                )
-                                / near
-                            )
-                        change = colour - plain[i, v, u, k]
-                        of_t += g * share * change
-                        of_share += g * (t - 0.5) * change
-                        of_plain[i, v, u, k] -= g * share * (t - 0.5)
-                    # The crossing is at p + s (q − p), s = (line − p⊥) / (q⊥ − p⊥).
-                    towards = of_t if outer > inner else -of_t
-                    of_s += towards * along
-                    of_along = towards * s - of_share * 2 * share * along / length
-                    of_rise = of_share * 2 * rise * (1 - share) / length - of_s * s / rise
-                    moved[i, one, axis] += towards - of_along
-                    moved[i, two, axis] += of_along
-                    moved[i, one, 1 - axis] += -of_s / rise - of_rise
-                    moved[i, two, 1 - axis] += of_rise
+            g = gradient[i, v, u, k]
+            colour = 1.0
+            if k < 3:
+                c0, c1 = colours[i, one, k], colours[i, two, k]
+                colour = (near0 * c0 + near1 * c1) / near
+                factor = g * share * (t - 0.5)
+                of_colours[i, one, k] += factor * near0 / near
+                of_colours[i, two, k] += factor * near1 / near
+                of_inverse[i, one] += factor * (1 - s) * (c0 - colour) / near
+                of_inverse[i, two] += factor * s * (c1 - colour) / near
+                slope = inverse[i, two] * (c1 - colour) - inverse[i, one] * (c0 - colour)
+                of_s += factor * slope / near
+            change = colour - plain[i, v, u, k]
+            of_t += g * share * change
+            of_share += g * (t - 0.5) * change
+            of_plain[i, v, u, k] -= g * share * (t - 0.5)
+        # The crossing is at p + s (q − p), s = (line − p⊥) / (q⊥ − p⊥).
+        towards = of_t if (u > x if axis == 0 else v > y) else -of_t
+        of_s += towards * along
+        of_along = towards * s - of_share * 2 * share * along / length
+        of_rise = of_share * 2 * rise * (1 - share) / length - of_s * s / rise
+        moved[i, one, axis] += towards - of_along
+        moved[i, two, axis] += of_along
+        moved[i, one, 1 - axis] += -of_s / rise - of_rise
+        moved[i, two, 1 - axis] += of_rise

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from probmotion.lifting.checks import Check
-from probmotion.models.latent.turn_code import TurnCode
+from tests.models.images.bodies import small_quadruped
 
 FRAMES, SIZE = 10, 64
 CHECKS = (Check("mask", 0.1, 0.2, "the mask is unlike the body's"),)
@@ -14,31 +14,7 @@ CHECKS = (Check("mask", 0.1, 0.2, "the mask is unlike the body's"),)
 
 @pytest.fixture(scope="session")
 def category():
-    """Quadruped of few vertices with random smooth motions."""
-    for library in ("torch", "numba", "skimage"):
-        pytest.importorskip(library, reason=f"{library} is not installed")
-    from probmotion.models.images.category import Category
-    from probmotion.models.images.surface import rest_surface
-    from probmotion.models.vae.motion_vae import MotionVAE
-
-    body, rng = MotionVAE.load("animal-vae").body, np.random.default_rng(0)
-    surface = rest_surface(body, 200)
-    shape = surface.vertices.shape
-    path = np.linspace(0, 1, FRAMES)[:, None, None]
-    ends = 0.12 * rng.normal(size=(2, 4, 1, len(body.bones), 3))
-    turns = ends[0] * (1 - path) + ends[1] * path
-    shapes = 0.01 * rng.normal(size=(3, 1, 3)) * surface.vertices[:, [1]]
-    return Category(
-        "quadruped",
-        body,
-        surface,
-        shapes,
-        np.tile([0.6, 0.4, 0.2], (shape[0], 1)),
-        0.05 * np.ones((1, *shape)),
-        TurnCode(turns[0] / 2, turns, 10.0),
-        0.06,
-        np.zeros((shape[0], 0)),
-    )
+    return small_quadruped()
 
 
 @pytest.fixture(scope="session")
