@@ -7,11 +7,15 @@ import pytest
 
 pytest.importorskip("torch")
 pytest.importorskip("numba")
+import torch
+
 from probmotion.models.images.category import Category
+from probmotion.models.images.encoder import Estimates
 from probmotion.models.images.made_images import make_images
 from probmotion.models.images.observation import ImageObservation
 from probmotion.models.images.surface_prior import SurfacePrior
 from probmotion.reconstruction import reconstruct
+from probmotion.reconstruction.inference import encoded
 from probmotion.reconstruction.refinement import Mode, refine
 
 SIZE, TANGENT = 64, np.array([0.15])
@@ -46,9 +50,27 @@ def test_refinement_finds_the_pose_again(animal) -> None:
         return float(np.linalg.norm(np.diff(joints - middle, axis=0), axis=-1).mean())
 
     assert distance(mode.theta) < 0.7 * distance(start)
+    # Draws keep the length of the two coordinates of the direction.
+    radial = np.zeros(prior.dim)
     place = slice(prior.layout.view.start, prior.layout.view.start + 2)
-    facing = mode.draw(rng, 400)[:, place] @ mode.theta[place]
-    assert (facing < 0).mean() < 0.01
+    radial[place] = mode.theta[place] / np.linalg.norm(mode.theta[place])
+    assert np.linalg.norm(mode.theta[place]) == pytest.approx(np.sqrt(2), rel=1e-5)
+    assert radial @ np.linalg.solve(mode.precision, radial) < 0.02
+
+
+def test_estimates_of_the_network_become_parameters(animal) -> None:
+    _, prior, images = animal
+    start, quarter = prior.layout.view.start, 1
+    means = torch.linspace(-0.3, 0.6, prior.dim - 1).tile(1, 4, 1)
+    weights = torch.tensor([[0.004, 0.99, 0.003, 0.003]]).log()
+    estimates = Estimates(weights, means, torch.full_like(means, -5.0))
+    found = encoded(lambda _: estimates, prior, observed(images, 0), np.random.default_rng(0), 0)
+    values = means[0, quarter].numpy()
+    assert found.shape == (1, prior.dim)
+    np.testing.assert_allclose(found[0, :start], values[1 : start + 1])
+    np.testing.assert_allclose(found[0, start + 2 :], values[start + 1 :])
+    yaw = np.arctan2(found[0, start], found[0, start + 1])
+    assert yaw == pytest.approx(np.pi / 2 + values[0])
 
 
 def test_draws_of_a_mode_have_its_moments() -> None:
@@ -89,6 +111,23 @@ def test_a_silhouette_of_something_else_is_not_trusted(animal) -> None:
 
 
 @pytest.mark.slow
+def test_intervals_hold(animal) -> None:
+    """Those of 90 %, of joints relative to their middle in the size of the truth."""
+    category, prior, _ = animal
+    made = make_images(prior, np.random.default_rng(11), 8, SIZE)
+    inside = []
+    for k in range(len(made.theta)):
+        result = reconstruct(observed(made, k), category, draws=100)
+        truth = prior.motion(made.theta[k])[0]
+        truth = truth - truth.mean(axis=0)
+        joints = result.joints - result.joints.mean(axis=1, keepdims=True)
+        size = np.sqrt((truth**2).sum() / (joints**2).sum(axis=(1, 2), keepdims=True))
+        low, high = np.quantile(size * joints, (0.05, 0.95), axis=0)
+        inside.append(((truth >= low) & (truth <= high)).mean())
+    assert 0.75 < np.mean(inside) < 0.99
+
+
+@pytest.mark.slow
 def test_draws_are_reproducible(animal) -> None:
     category, _, made = animal
     one, other = (reconstruct(observed(made, 0), category, draws=3, seed=1) for _ in range(2))
@@ -101,8 +140,6 @@ def test_a_clip_is_reconstructed_as_one_motion(animal) -> None:
     clip = SurfacePrior(category, np.repeat(TANGENT, 2))
     theta = make_images(SurfacePrior(category, TANGENT), np.random.default_rng(5), 1, SIZE).theta
     theta = np.concatenate([theta, np.zeros((1, clip.dim - theta.shape[1]))], axis=1)
-    import torch
-
     with torch.no_grad():
         images = clip.render(torch.as_tensor(theta), SIZE)[0].numpy()
     rotation = np.tile(np.eye(3), (2, 1, 1))
