@@ -151,10 +151,11 @@ pd.Series(compared(result, truth)).round(2)
 # %% [markdown]
 # ## 4. What one image leaves open
 #
-# From the front, an animal has nearly the same silhouette as from behind, and its mirror image is as probable. Another
-# image shows this: below, draws given its mask alone, seen by the camera and from above, where it did not look; and draws
-# given its colours, too. The truth, in black, faces away from the camera. Shading helps with the direction, but not
-# always, and left and right remain open here: the guide to `probmotion reconstruct` has the errors of many images.
+# Seen from behind, an animal and its mirror image have nearly the same silhouette, and depth is seen only through
+# perspective. Another image shows what remains: below, draws given its mask alone, seen by the camera and from above, where
+# it did not look; and draws given its colours, too. The truth is in black. Here, the mask tells that the animal faces away,
+# but hardly whether slightly to the right or to the left; the guide to `probmotion reconstruct` has the errors of many
+# images.
 
 # %%
 other = make_images(prior, np.random.default_rng(21), 1, 128)
