@@ -77,11 +77,13 @@ def stream_draws(
     check_count("chains", chains)
     folder = writable_folder(Path(path), "stream")
     forget_killed(folder)
-    files = {file.name for file in folder.iterdir()}
-    # A run that was killed in its first block leaves a lock and incomplete draws.
-    if _LAST not in files and files and (LOCK not in files or files - {LOCK, _DRAWS}):
-        raise ValueError(f"stream must be a new folder or one of a run, got {str(path)!r}")
+    if any(folder.iterdir()) and not (folder / LOCK).exists():
+        raise _not_a_run(path)
     with locked_folder("stream", folder), progress_bar(draws, sampler.name, progress) as bar:
+        files = {file.name for file in folder.iterdir()}
+        # A run that was killed in its first block leaves a lock and incomplete draws.
+        if _LAST not in files and files - {LOCK, _DRAWS}:
+            raise _not_a_run(path)
         for unfinished in (folder / _DRAWS).rglob("*.partial"):
             unfinished.unlink()
         last = _last_of(folder)
@@ -142,6 +144,10 @@ def open_draws(path: str | Path) -> MotionDraws:
     if last is None:
         raise FileNotFoundError(f"path must be a folder with complete draws, got {str(path)!r}")
     return _opened(Path(path), last, _number(last))
+
+
+def _not_a_run(path: str | Path) -> ValueError:
+    return ValueError(f"stream must be a new folder or one of a run, got {str(path)!r}")
 
 
 def _last_of(folder: Path) -> MotionDraws | None:

@@ -163,11 +163,11 @@ def test_folders_in_use_and_other_folders_are_refused(posterior, tmp_path):
     with pytest.raises(FileNotFoundError, match="path must be a folder with complete draws"):
         pm.open_draws(tmp_path)
     (tmp_path / "notes.txt").unlink()
-    with (
-        locked_folder("stream", tmp_path),
-        pytest.raises(ValueError, match="to which another process writes"),
-    ):
-        streams.stream_draws(SAMPLERS["mh"], posterior, tmp_path, **RUN)
+    with locked_folder("stream", tmp_path):
+        for unfinished in ("nothing yet", "last.nc.partial"):
+            with pytest.raises(ValueError, match="to which another process writes"):
+                streams.stream_draws(SAMPLERS["mh"], posterior, tmp_path, **RUN)
+            (tmp_path / unfinished).touch()
 
 
 def test_damaged_draws_are_not_believed(posterior, tmp_path):
