@@ -33,6 +33,7 @@ _X, _Y, _LOG_WIDTH = (0.0, 0.11), (-0.12, 0.11), (math.log(0.58), 0.18)
 _YAW_CHANGE, _TILT_CHANGE, _CENTRE_CHANGE, _WIDTH_CHANGE = 0.15, 0.04, 0.06, 0.03
 _LIGHT, _LIGHT_SPREAD = (0.0, -0.5, -0.4), 0.35
 _AMBIENT = (0.55, 0.12)
+_SAME_AXES = 1e-9
 
 
 class SurfaceParameters(NamedTuple):
@@ -41,7 +42,7 @@ class SurfaceParameters(NamedTuple):
     ``turns`` (B, L, bones, 3): rotation vectors, radians; ``log_lengths`` (B, G);
     ``rest_vertices`` and ``albedo`` (B, V, 3); ``light`` (B, 3) and ``ambient`` (B,) as for
     :func:`~probmotion.models.images.posing.shaded`; ``rotation`` (B, T, 3, 3) from the body's to
-    the camera's axes, and ``translation`` (B, T, 3) of the root, metres.
+    the first camera's axes, and ``translation`` (B, T, 3) of the root in these, metres.
     """
 
     turns: torch.Tensor
@@ -76,8 +77,8 @@ class SurfacePrior(StandardNormalPrior):
 
     θ ~ N(0, I) has the motion code z, the bone lengths, the shape, the colours, the light and the
     body's pose relative to the camera, in this order. The direction in which the body faces is that
-    of two coordinates and thus uniform. Motions have the axes of the camera with Y up and Z
-    towards it; the body keeps its place after the last image.
+    of two coordinates and thus uniform. Motions have the axes of the first image's camera with Y up
+    and Z towards it; the body keeps its place after the last image.
 
     Parameters
     ----------
@@ -88,15 +89,22 @@ class SurfacePrior(StandardNormalPrior):
     renderer : Renderer, optional
         Renderer of the images; a :class:`~probmotion.models.images.rasterizer.Rasterizer` by
         default.
+    rotation : ndarray, (T, 3, 3), optional
+        From common axes, as those of the image, to those of each crop; equal by default.
 
     Raises
     ------
     ValueError
-        If there are more images than frames of the motion code.
+        If there are more images than frames of the motion code, or shapes disagree.
     """
 
     def __init__(
-        self, category: Category, tangent: np.ndarray, renderer: Renderer | None = None
+        self,
+        category: Category,
+        tangent: np.ndarray,
+        renderer: Renderer | None = None,
+        *,
+        rotation: np.ndarray | None = None,
     ) -> None:
         self.category = category
         self.renderer = Rasterizer() if renderer is None else renderer
@@ -112,6 +120,11 @@ class SurfacePrior(StandardNormalPrior):
             )
         self.skeleton, self.frames, self.fps = body.skeleton, code.frames, code.fps
         self.images = len(self.tangent)
+        self.turned = np.tile(np.eye(3), (self.images, 1, 1))
+        """From the axes of the first crop to those of each, (T, 3, 3)."""
+        if rotation is not None:
+            check_shape("rotation", rotation, (self.images, 3, 3))
+            self.turned = rotation @ rotation[0].T
         self.layout = _Layout.of(
             code.dim,
             body.n_groups,
@@ -142,8 +155,8 @@ class SurfacePrior(StandardNormalPrior):
         return joints if isinstance(theta, torch.Tensor) else joints.numpy()
 
     def vertices(self, theta: torch.Tensor) -> torch.Tensor:
-        """Return the surface in each image, ``(B, dim) → (B, T, V, 3)``, in camera axes, metres."""
-        return self._posed(self.parameters(theta))
+        """Return the surface in each image's camera axes, ``(B, dim) → (B, T, V, 3)``, metres."""
+        return self._seen(self._posed(self.parameters(theta)))
 
     def render(self, theta: torch.Tensor, size: int) -> torch.Tensor:
         """Return the images, ``(B, dim) → (B, T, size, size, 4)``.
@@ -152,11 +165,12 @@ class SurfacePrior(StandardNormalPrior):
         """
         p = self.parameters(theta)
         vertices = self._posed(p)
+        seen = self._seen(vertices)
         triangles = self.category.surface.triangles
         images = []
         for t, tangent in enumerate(self.tangent):
             colours = shaded(vertices[:, t], triangles, p.albedo, p.light, p.ambient)
-            image = self.renderer.render(vertices[:, t], triangles, colours, float(tangent), size)
+            image = self.renderer.render(seen[:, t], triangles, colours, float(tangent), size)
             images.append(image)
         return torch.stack(images, dim=1)
 
@@ -167,6 +181,13 @@ class SurfacePrior(StandardNormalPrior):
             raise ValueError(
                 f"likelihood must be of images with the prior's tangent, {self.tangent}, got "
                 f"{tangent}"
+            )
+        turned = likelihood.rotation @ likelihood.rotation[0].T
+        difference = float(np.abs(turned - self.turned).max())
+        if difference > _SAME_AXES:
+            raise ValueError(
+                "likelihood must be of images with the prior's rotation, got a difference of "
+                f"{difference:.2g} between the axes of two crops; give rotation to SurfacePrior"
             )
 
     def log_likelihood(self, theta: Array, likelihood: ImageObservation) -> Array:
@@ -243,7 +264,7 @@ class SurfacePrior(StandardNormalPrior):
         )
 
     def _views(self, view: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the rotations (B, T, 3, 3) from body to camera and roots (B, T, 3)."""
+        """Return the rotations (B, T, 3, 3) from body to first camera, and roots (B, T, 3)."""
         first, later = view[:, :7], view[:, 7:].unflatten(-1, (self.images - 1, 6))
         scales = (_YAW_CHANGE, _TILT_CHANGE, _TILT_CHANGE, _CENTRE_CHANGE, _CENTRE_CHANGE)
         changes = later * torch.tensor((*scales, _WIDTH_CHANGE), dtype=view.dtype)
@@ -264,13 +285,20 @@ class SurfacePrior(StandardNormalPrior):
         width = log_width.exp()
         tangent = torch.as_tensor(self.tangent, dtype=view.dtype)
         middle = torch.stack([x * width, y * width, width / tangent], dim=-1)
+        turned = torch.as_tensor(self.turned, dtype=view.dtype)
+        middle = (turned.mT @ middle[..., None])[..., 0]
         offset = torch.as_tensor(self._middle, dtype=view.dtype)
         return rotation, middle - rotation @ offset
 
     def _posed(self, p: SurfaceParameters) -> torch.Tensor:
+        """Return the surface in each image in the axes of the first camera, (B, T, V, 3)."""
         return self.category.skin.posed(
             p.rest_vertices, p.turns[:, : self.images], p.rotation, p.translation, p.log_lengths
         )
+
+    def _seen(self, vertices: torch.Tensor) -> torch.Tensor:
+        """Return vertices (B, T, V, 3) in the axes of each camera."""
+        return vertices @ torch.as_tensor(self.turned, dtype=vertices.dtype).mT
 
 
 def _flip(dtype: torch.dtype) -> torch.Tensor:

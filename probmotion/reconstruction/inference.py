@@ -55,7 +55,7 @@ def reconstruct(
         If there are more images than frames of the category's motions.
     """
     check_count("draws", draws, 2)
-    prior = SurfacePrior(category, observation.tangent)
+    prior = SurfacePrior(category, observation.tangent, rotation=observation.rotation)
     modes = posterior_modes(encoder_of(category), prior, observation, seed)
     chosen = mixture_draws(modes, seeds.generator(seed, "draws"), draws)
     result = Reconstruction(observation, prior, modes[0].theta, chosen, ())

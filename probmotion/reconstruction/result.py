@@ -63,11 +63,7 @@ class Reconstruction:
         check_count("draws", len(self.draws), 2)
         check_finite("theta", self.theta)
         check_finite("draws", self.draws)
-        if not np.array_equal(self.prior.tangent, self.observation.tangent):
-            raise ValueError(
-                f"prior must have the tangent {self.observation.tangent} of the observation, got "
-                f"{self.prior.tangent}"
-            )
+        self.prior.check_observations(self.observation)
 
     @cached_property
     def joints(self) -> np.ndarray:

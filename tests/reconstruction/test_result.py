@@ -165,7 +165,7 @@ def test_all_files_are_saved(result, tmp_path):
     [
         ({"draws": np.zeros((4, 3))}, "draws must have shape"),
         ({"theta": np.zeros(3)}, "theta must have shape"),
-        ({"observation": 0.3}, "prior must have the tangent"),
+        ({"observation": 0.3}, "the prior's tangent"),
     ],
 )
 def test_disagreeing_parts_are_refused(result, change, message):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.ndimage import maximum_filter
+from scipy.spatial.transform import Rotation
 
 from probmotion.models.images.image_likelihood import ImageLikelihood
 from probmotion.models.images.made_images import make_images
@@ -15,6 +16,7 @@ from probmotion.models.images.observation import ImageObservation
 from probmotion.models.images.posing import shaded
 from probmotion.models.images.surface_prior import SurfacePrior
 from probmotion.posteriors.posterior import MotionPosterior
+from probmotion.reconstruction.moving_surface import surface_frames
 from tests.models.images.meshes import icosphere
 
 SIZE, TANGENT = 64, 0.15
@@ -166,6 +168,28 @@ def test_the_path_of_a_clip_begins_at_the_first_pose(category) -> None:
     torch.testing.assert_close(vertices[:, 0], vertices[:, 2])
     with pytest.raises(ValueError, match="at most 10"):
         SurfacePrior(category, np.full(11, TANGENT))
+
+
+def test_crops_of_a_clip_have_their_own_axes(category) -> None:
+    """A camera that follows a still body turns; the body does not."""
+    axis, angle = np.array([0.2, 1.0, -0.1]), np.radians([5.0, 20.0, 40.0])
+    rotation = Rotation.from_rotvec(angle[:, None] * axis).as_matrix()
+    clip = SurfacePrior(category, np.full(3, TANGENT), rotation=rotation)
+    theta = clip.initial(np.random.default_rng(4), 1)
+    theta[:, clip.layout.view.start + 7 :] = 0.0
+    p = clip.parameters(torch.as_tensor(theta))
+    torch.testing.assert_close(p.rotation[:, 0], p.rotation[:, 2])
+    seen = clip.vertices(torch.as_tensor(theta))[0].numpy()
+    common = surface_frames(clip, theta)[0, :3] * [1.0, -1.0, -1.0]
+    # Points in the axes of the image, which both crops and motions turn.
+    np.testing.assert_allclose(seen @ rotation, common @ rotation[0], atol=1e-9)
+    middle = (p.translation + p.rotation @ torch.as_tensor(clip._middle))[0].numpy()
+    in_crop = ((middle @ rotation[0])[:, None] @ rotation.swapaxes(1, 2))[:, 0]
+    np.testing.assert_allclose(in_crop, np.repeat(clip.middle(theta), 3, axis=0), atol=1e-9)
+    mask = np.pad(np.ones((3, 16, 16)), ((0, 0), (8, 8), (8, 8)))
+    other = ImageObservation(mask, None, None, clip.tangent, rotation[::-1])
+    with pytest.raises(ValueError, match="the prior's rotation, got a difference of 1"):
+        clip.check_observations(other)
 
 
 def test_light_from_one_side(prior) -> None:
