@@ -455,9 +455,13 @@ def main() -> None:
     command.add_argument("--held-out", nargs="*", default=SALSA_HELD_OUT, help="Salsa clips.")
     commands.add_parser("diffusion", help="Diffusion samplers against exact posteriors.")
     command = commands.add_parser("images", help="Reconstructions of made images.")
-    command.add_argument("--data", type=Path, help="Folder with recorded dogs; else synthetic.")
+    command.add_argument("--category", choices=["quadruped", "person"], default="quadruped")
+    command.add_argument("--data", type=Path, help="Folder with real motions; else synthetic ones.")
     command.add_argument("--part", choices=["validation", "test"], default="test")
-    command.add_argument("--images", type=int, default=100, help="Number of images.")
+    command.add_argument(
+        "--images", type=int, default=200, help="Number of images; 200 by default."
+    )
+    command.add_argument("--clips", type=int, default=0, help="Number of clips; 0 by default.")
     command.add_argument("--ablations", action="store_true", help="Also without parts of it.")
     command = commands.add_parser("lift", help="Lifts of made videos of held-out clips.")
     command.add_argument("--data", required=True, help="Folder with the real motions.")
@@ -471,31 +475,24 @@ def main() -> None:
     command.add_argument("--data", required=True, help="Folder with the real motions.")
     commands.add_parser("mixing", help="Samplers of many modes within budgets.")
     options = parser.parse_args()
+    figures: Figures
     if options.command == "images":
-        rest = (options.part, options.images, options.ablations)
-        for name, value in image_figures(options.data, *rest):
-            print(f"{name}: {value:.4g}", flush=True)
-        return
-    if options.command == "lift":
-        for name, value in lift_figures(Path(options.data), options.lifter):
-            print(f"{name}: {value:.4g}", flush=True)
-        return
-    if options.command == "learnt":
-        for name, value in learnt_figures(Path(options.data)):
-            print(f"{name}: {value:.4g}", flush=True)
-        return
-    if options.command in ("diffusion", "mixing"):
+        rest = (options.part, options.images, options.clips, options.ablations)
+        figures = image_figures(options.category, options.data, *rest)
+    elif options.command == "lift":
+        figures = lift_figures(Path(options.data), options.lifter)
+    elif options.command == "learnt":
+        figures = learnt_figures(Path(options.data))
+    elif options.command in ("diffusion", "mixing"):
         figures = diffusion_figures() if options.command == "diffusion" else mixing_figures()
-        for name, value in figures:
-            print(f"{name}: {value:.4g}", flush=True)
-        return
-    pairs = salsa(options.data, tuple(options.held_out))
-    for part in options.parts:
-        figures = (
+    else:
+        pairs = salsa(options.data, tuple(options.held_out))
+        figures = itertools.chain.from_iterable(
             denoising_figures(Path(options.data)) if part == "denoising" else PARTS[part](pairs)
+            for part in options.parts
         )
-        for name, value in figures:
-            print(f"{name}: {value:.4g}", flush=True)
+    for name, value in figures:
+        print(f"{name}: {value:.4g}", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,71 +1,92 @@
 """Accuracy of reconstructions of made images: held-out poses, shapes, colours and views.
 
-Poses are those of held-out clips, which the category's motion code does not reproduce exactly.
-Coverages are those of joints relative to their middle, after scaling each draw to the truth, since
-one image determines no size. ``*_without_colours``: masks alone; ``*_without_shapes``: bodies of
-the mean surface; ``*_one_hypothesis``: the encoder's likeliest quarter turn alone;
-``*_encoder``: its mean, without refinement.
+Poses are those of held-out clips, which the category's motion code does not reproduce exactly;
+bodies, light and views are drawn from the category. Joints are relative to their middle, in the
+size of the truth, since images determine no size; those of ``pck_01`` are in the image.
+``mask_iou_encoder``: the encoder's mean, without refinement. ``*_error``: standard errors.
+
+``*_without_colours``: masks alone; ``*_without_shapes``: bodies of the mean surface;
+``*_one_hypothesis``: the encoder's likeliest quarter turn alone; ``*_with_features``: with made
+features of the surface; ``*_without_motion_prior``: bone rotations that are independent of one
+another, with the spreads of the motion code.
+
+``transfer_pck_01``: keypoints of an image that the reconstructed surface transfers to another image
+of another body, within a tenth of its size (*Ponymation*, section 4.2.2).
+
+``clip_*``: clips of as many images as the motion code has frames. ``clip_velocity_error`` is that
+of the same section, in the plane of the image; ``clip_velocity_error_3d`` is the same with the
+depth. A body that does not move has error 1. ``clip_speed_ratio``: mean speed of joints over the
+true one. ``clip_*_images_alone``: each image reconstructed without the others;
+``clip_*_of_code``: the true motion as far as the motion code reproduces it, without images.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import itertools
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from keypoint_transfer import View
+from made_bodies import SIZE, TANGENT, Bodies, Example
 
 import probmotion.reconstruction.inference as inference
 from probmotion import seeds
-from probmotion.data.synthetic import animal_clips
-from probmotion.models.bodies.turn_fit import fit_turns
-from probmotion.models.images.category import Category
-from probmotion.models.images.encoder_training import encoder_of
-from probmotion.models.images.made_images import make_images
+from probmotion.metrics.keypoints import velocity_error
 from probmotion.models.images.observation import ImageObservation
 from probmotion.models.images.surface_prior import SurfacePrior
 from probmotion.models.latent.turn_code import TurnCode
-from probmotion.reconstruction.refinement import refine
+from probmotion.reconstruction.refinement import Mode, refine
 
-SIZE, TANGENT = 128, 0.15
 DRAWS = 200
 ABLATED = 40  # images of each ablation
+STARTS, KEPT = 6, 3  # as in posterior_modes
+ABLATIONS = (
+    "_without_colours",
+    "_without_shapes",
+    "_one_hypothesis",
+    "_with_features",
+    "_without_motion_prior",
+)
 
 Figures = Iterator[tuple[str, float]]
 
 
-class Examples:
-    """Made images of held-out animals, with their joints and θ."""
+def found(
+    bodies: Bodies, observation: ImageObservation, suffix: str
+) -> tuple[SurfacePrior, list[Mode]]:
+    """Return the modes of the posterior, with or without a part of it, and their prior."""
+    category = bodies.featured if suffix == "_with_features" else bodies.category
+    if suffix != "_with_features":
+        observation = replace(observation, features=None)
+    if suffix == "_without_colours":
+        observation = replace(observation, rgb=None)
+    if suffix == "_without_shapes":
+        category = replace(category, shapes=1e-6 * category.shapes)
+    prior = SurfacePrior(category, observation.tangent)
+    rng = seeds.generator(0, "starts")
+    if suffix == "_one_hypothesis":
+        starts = inference.encoded(bodies.network, prior, observation, rng, 0)
+        return prior, refine(prior, observation, starts[:1])
+    if suffix == "_without_motion_prior":
+        starts = inference.encoded(bodies.network, prior, observation, rng, STARTS)
+        prior, starts = independent(prior, starts)
+        return prior, refine(prior, observation, starts, keep=KEPT)
+    return prior, inference.posterior_modes(bodies.network, prior, observation)
 
-    def __init__(self, data: Path | None, part: str, n: int) -> None:
-        self.category = Category.load("quadruped")
-        self.prior = SurfacePrior(self.category, np.array([TANGENT]))
-        self.length = float(np.ptp(self.category.body.rest_positions[:, 2]))
-        rng = seeds.generator(0, f"images {part}")
-        code, skeleton = self.category.code, self.category.body.skeleton
-        windows = []
-        for clip in animal_clips(data)[part]:
-            positions = clip.retarget(skeleton).resample(code.fps).positions
-            last = len(positions) - code.frames
-            windows += [positions[s : s + code.frames] for s in range(0, last + 1, 5)]
-        chosen = rng.choice(len(windows), size=n, replace=n > len(windows))
-        fit = fit_turns(self.category.body, np.array(windows)[chosen])
-        theta = self.prior.initial(rng, n)
-        theta[:, self.prior.layout.lengths] = fit.log_lengths / self.category.length_spread
-        self.observations, self.joints, self.points = [], [], []
-        for k in range(n):
-            # A code whose only motion is the true one.
-            true = TurnCode(fit.turns[k], np.zeros((code.dim, *fit.turns[k].shape)), code.fps)
-            prior = SurfacePrior(replace(self.category, code=true), np.array([TANGENT]))
-            made = make_images(prior, rng, 1, SIZE, theta[k : k + 1])
-            self.observations.append(
-                ImageObservation(made.mask, made.rgb, None, np.array([TANGENT]), np.eye(3)[None])
-            )
-            joints = prior.motion(made.theta)[0, 0]
-            self.joints.append(joints)
-            self.points.append(seen(joints))
+
+def independent(prior: SurfacePrior, theta: np.ndarray) -> tuple[SurfacePrior, np.ndarray]:
+    """Return a prior of one image with independent bone rotations, and θ of the same bodies."""
+    code, at = prior.category.code, prior.layout.code
+    mean = code.turns(np.zeros(code.dim))[:1]
+    spread = np.linalg.norm(code.turns(np.eye(code.dim))[:, 0] - mean[0], axis=0)
+    basis = np.diag(spread.ravel()).reshape(-1, *mean.shape)
+    z = ((code.turns(theta[:, at])[:, 0] - mean[0]) / spread).reshape(len(theta), -1)
+    category = replace(prior.category, code=TurnCode(mean, basis, code.fps))
+    return SurfacePrior(category, prior.tangent), np.hstack([z, theta[:, at.stop :]])
 
 
 def seen(joints: np.ndarray) -> np.ndarray:
@@ -75,74 +96,182 @@ def seen(joints: np.ndarray) -> np.ndarray:
 
 
 def scaled(joints: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Return joints (…, J, 3) relative to their middle, in the size of the truth (J, 3)."""
+    """Return joints (…, J, 3) relative to their middle, in the size of the truth (…, J, 3)."""
     joints = joints - joints.mean(axis=-2, keepdims=True)
-    truth = truth - truth.mean(axis=0)
+    truth = truth - truth.mean(axis=-2, keepdims=True)
     # The ratio of sizes: that of least squares would shrink bodies that face elsewhere.
-    size = np.sqrt((truth**2).sum() / (joints**2).sum(axis=(-1, -2)))
+    size = np.sqrt((truth**2).sum(axis=(-1, -2)) / (joints**2).sum(axis=(-1, -2)))
     return np.asarray(size[..., None, None] * joints)
 
 
-def measured(examples: Examples, suffix: str = "", **changes: Any) -> Figures:
-    """Yield the figures of reconstructions of all images."""
-    rows, inside = [], []
-    observations = examples.observations[: ABLATED if suffix else None]
-    category = changes.get("category", examples.category)
-    network = encoder_of(examples.category)
-    for number, observation in enumerate(observations):
-        truth = examples.joints[number]
-        if not changes.get("colours", True):
-            observation = replace(observation, rgb=None)
-        prior = SurfacePrior(category, observation.tangent)
-        if "hypotheses" in changes:
-            rng = seeds.generator(0, "starts")
-            starts = inference.encoded(network, prior, observation, rng, 0)
-            modes = refine(prior, observation, starts[:1])
-        else:
-            modes = inference.posterior_modes(network, prior, observation, 0)
-        theta = modes[0].theta
-        joints = prior.motion(theta)[0]
-        centred = truth - truth.mean(axis=0)
-        error = np.linalg.norm(scaled(joints, truth) - centred, axis=-1).mean()
-        points = examples.points[number]
-        near = 0.1 * np.ptp(points, axis=0).max()
-        correct = np.linalg.norm(seen(joints) - points, axis=-1) < near
-        rows.append((overlap(prior, theta, observation), correct.mean(), error / examples.length))
-        draws = inference.mixture_draws(modes, seeds.generator(number, "draws"), DRAWS)
-        low, high = np.quantile(scaled(prior.motion(draws)[:, 0], truth), (0.05, 0.95), axis=0)
-        inside.append(((centred >= low) & (centred <= high)).mean())
-    names = ("mask_iou", "pck_01", "joint_error_share_of_length")
-    values = np.array(rows)
-    for name, column in zip(names, values.T, strict=True):
-        yield name + suffix, float(column.mean())
-        yield f"{name}{suffix}_error", float(column.std(ddof=1) / np.sqrt(len(column)))
-    yield "coverage_90" + suffix, float(np.mean(inside))
+def joint_errors(joints: np.ndarray, truth: np.ndarray, length: float) -> dict[str, float]:
+    """Return errors of joints (T, J, 3), and of their velocities if there are several images."""
+
+    def points(joints: np.ndarray) -> np.ndarray:
+        """Return points of the plane (T, 2 J, 2) that move as far as the joints in space."""
+        return np.concatenate([joints[..., :2], joints[..., 1:] * [0.0, 1.0]], axis=1)
+
+    joints, truth = scaled(joints, truth), scaled(truth, truth)
+    error = float(np.linalg.norm(joints - truth, axis=-1).mean() / length)
+    if len(truth) == 1:
+        return {"joint_error_share_of_length": error}
+    speeds = [np.linalg.norm(np.diff(each, axis=0), axis=-1).mean() for each in (joints, truth)]
+    return {
+        "joint_error_share_of_length": error,
+        "velocity_error": velocity_error(joints[..., :2], truth[..., :2]),
+        "velocity_error_3d": velocity_error(points(joints), points(truth)),
+        "speed_ratio": float(speeds[0] / speeds[1]),
+    }
 
 
-def overlap(prior: SurfacePrior, theta: np.ndarray, observation: ImageObservation) -> float:
-    """Return the intersection over union of silhouette and mask, over known pixels."""
+def overlaps(prior: SurfacePrior, theta: np.ndarray, observation: ImageObservation) -> float:
+    """Return the mean intersection over union of silhouettes and masks, over known pixels."""
     with torch.no_grad():
         images = prior.render(torch.as_tensor(theta[None], dtype=torch.float32), SIZE)
-    mask = observation.mask[0]
-    known, inside = np.isfinite(mask), np.nan_to_num(mask) >= 0.5
-    covered = (images[0, 0, ..., 3].numpy() >= 0.5) & known
-    return float((covered & inside).sum() / (covered | inside).sum())
+    known, inside = np.isfinite(observation.mask), np.nan_to_num(observation.mask) >= 0.5
+    covered = (images[0, ..., -1].numpy() >= 0.5) & known
+    both, either = (covered & inside).sum(axis=(1, 2)), (covered | inside).sum(axis=(1, 2))
+    return float((both / either).mean())
 
 
-def image_figures(data: Path | None, part: str, n: int, ablations: bool) -> Figures:
-    """Yield all figures of ``n`` images of clips of a part of the split."""
-    examples = Examples(data, part, n)
-    network, prior = encoder_of(examples.category), examples.prior
-    feed_forward = [
-        overlap(
-            prior, inference.encoded(network, prior, each, np.random.default_rng(0), 0)[0], each
+class Estimate(NamedTuple):
+    """Joints (T, J, 3) and vertices (T, V, 3) of a reconstruction, with axes as in examples.
+
+    ``draws`` (n, T, J, 3) are joints; ``mask_iou`` is a mean over images.
+    """
+
+    joints: np.ndarray
+    vertices: np.ndarray
+    draws: np.ndarray
+    mask_iou: float
+
+
+def reconstructed(
+    bodies: Bodies, observation: ImageObservation, suffix: str, seed: int
+) -> Estimate:
+    """Return the reconstruction of an image or clip."""
+    if suffix == "_images_alone":
+        alone = [
+            reconstructed(bodies, image_of(observation, t), "", seed)
+            for t in range(observation.images)
+        ]
+        joints, vertices, draws, shares = zip(*alone, strict=True)
+        return Estimate(
+            np.concatenate(joints),
+            np.concatenate(vertices),
+            np.concatenate(draws, axis=1),
+            float(np.mean(shares)),
         )
-        for each in examples.observations
+    prior, modes = found(bodies, observation, suffix)
+    theta, images = modes[0].theta, observation.images
+    drawn = inference.mixture_draws(modes, seeds.generator(seed, "draws"), DRAWS)
+    return Estimate(
+        prior.motion(theta)[:images],
+        prior.vertices(torch.as_tensor(theta[None]))[0].numpy(),
+        prior.motion(drawn)[:, :images],
+        overlaps(prior, theta, observation),
+    )
+
+
+def errors_of(estimate: Estimate, example: Example, length: float) -> dict[str, float]:
+    """Return the figures of one reconstruction."""
+    truth = example.joints
+    near = 0.1 * np.ptp(seen(truth), axis=1).max(axis=1, keepdims=True)
+    correct = np.linalg.norm(seen(estimate.joints) - seen(truth), axis=-1) < near
+    centred = scaled(truth, truth)
+    low, high = np.quantile(scaled(estimate.draws, truth), (0.05, 0.95), axis=0)
+    return {
+        "mask_iou": estimate.mask_iou,
+        "pck_01": float(correct.mean()),
+        "coverage_90": float(((centred >= low) & (centred <= high)).mean()),
+        **joint_errors(estimate.joints, truth, length),
+    }
+
+
+def transfers(bodies: Bodies, examples: list[Example], estimates: list[Estimate]) -> list[float]:
+    """Return the shares of keypoints that each first image transfers correctly to the next one."""
+    views = []
+    for example, estimate in zip(examples, estimates, strict=True):
+        surface = replace(bodies.category.surface, vertices=estimate.vertices[0])
+        joints = example.joints[0] * [1.0, -1.0, -1.0]
+        mask = example.observation.mask[0]
+        views.append(View.of(joints, example.vertices[0], surface, mask, TANGENT))
+    pairs = zip(views, views[1:] + views[:1], strict=True)
+    shares = [view.transferred(other) for view, other in pairs]
+    return [share for share in shares if np.isfinite(share)]
+
+
+def image_of(observation: ImageObservation, t: int) -> ImageObservation:
+    """Return one image of a clip."""
+    own: dict[str, Any] = {}
+    for name in ("mask", "rgb", "features", "tangent", "rotation"):
+        array = getattr(observation, name)
+        own[name] = None if array is None else array[t : t + 1]
+    return replace(observation, **own)
+
+
+def measured(bodies: Bodies, examples: Iterable[Example], suffix: str = "") -> Figures:
+    """Yield the figures of reconstructions of images, or of clips."""
+    examples = list(examples)
+    estimates = [
+        reconstructed(bodies, example.observation, suffix, number)
+        for number, example in enumerate(examples)
     ]
-    yield "mask_iou_encoder", float(np.mean(feed_forward))
-    yield from measured(examples)
+    pairs = zip(estimates, examples, strict=True)
+    rows = [errors_of(estimate, example, bodies.length) for estimate, example in pairs]
+    yield from means(rows, suffix)
+    if examples[0].observation.images == 1:
+        shares = transfers(bodies, examples, estimates)
+        yield from means([{"transfer_pck_01": share} for share in shares], suffix)
+
+
+def of_code(bodies: Bodies, n: int) -> Figures:
+    """Yield errors of the motions of the code that are closest to those of ``n`` bodies."""
+    rows = []
+    for number in range(n):
+        closest = bodies.clip(number, bodies.reproduced(number))
+        rows.append(joint_errors(closest.joints, bodies.clip(number).joints, bodies.length))
+    yield from means(rows, "_of_code")
+
+
+def of_encoder(bodies: Bodies, n: int) -> Figures:
+    """Yield the overlap of the encoder's likeliest bodies with the masks."""
+    rows = []
+    for number in range(n):
+        observation = bodies.image(number).observation
+        prior = SurfacePrior(bodies.category, observation.tangent)
+        rng = np.random.default_rng(0)
+        theta = inference.encoded(bodies.network, prior, observation, rng, 0)[0]
+        rows.append({"mask_iou": overlaps(prior, theta, observation)})
+    yield from means(rows, "_encoder")
+
+
+def means(rows: list[dict[str, float]], suffix: str) -> Figures:
+    """Yield the mean and standard error of every figure."""
+    for name in rows[0]:
+        values = [row[name] for row in rows]
+        yield name + suffix, float(np.mean(values))
+        yield f"{name}{suffix}_error", float(np.std(values, ddof=1) / np.sqrt(len(values)))
+
+
+def image_figures(
+    name: str, data: Path | None, part: str, images: int, clips: int, ablations: bool
+) -> Figures:
+    """Yield all figures of a category; names are preceded by that of ``person``."""
+    bodies = Bodies(name, data, part, max(images, clips))
+
+    def of_images(n: int, suffix: str = "") -> Figures:
+        return measured(bodies, map(bodies.image, range(n)), suffix)
+
+    def of_clips(suffix: str = "") -> Figures:
+        return measured(bodies, map(bodies.clip, range(clips)), suffix)
+
+    parts = {"": [of_encoder(bodies, images), of_images(images)], "clip_": []}
     if ablations:
-        yield from measured(examples, "_without_colours", colours=False)
-        flat = replace(examples.category, shapes=1e-6 * examples.category.shapes)
-        yield from measured(examples, "_without_shapes", category=flat)
-        yield from measured(examples, "_one_hypothesis", hypotheses=1)
+        parts[""] += [of_images(min(images, ABLATED), suffix) for suffix in ABLATIONS]
+    if clips:
+        parts["clip_"] = [of_code(bodies, clips), of_clips(), of_clips("_images_alone")]
+    before = "" if name == "quadruped" else f"{name}_"
+    for prefix, figures in parts.items():
+        for figure, value in itertools.chain.from_iterable(figures):
+            yield before + prefix + figure, value

@@ -195,8 +195,9 @@ pd.DataFrame({name: compared(each, other_truth) for name, each in results.items(
 #
 # The draws above are from Gaussians about modes that are wider than the posterior: they count .5 % of the image's
 # information. An image is an observation like any other, and `pm.posterior(prior, observation)` is the posterior for
-# every sampler of densities. Metropolis-Hastings starts at the draws and needs no approximation. Its chains are short and
-# rarely move from one direction to another: they say how wide the modes are, not how probable.
+# every sampler of densities. Metropolis-Hastings starts at the draws and approximates nothing, but in a minute it does not
+# converge: the density has many narrow modes, and chains keep much of the spread of their starts. They show that the draws
+# lead to bodies of higher density, not how wide the posterior is.
 
 # %%
 silhouette = results["mask alone"]
@@ -228,7 +229,7 @@ pd.DataFrame(
 #
 # Every draw is also a motion: it starts at the pose in the image, and the code of the motion says how it goes on. `save`
 # writes a page for the browser (`reconstruct.html`: the outline over the image, other views, and draws as moving
-# surfaces), and `body.glb`, the coloured surface with its skeleton and a motion.
+# surfaces), and `body.glb`, the textured surface with its skeleton and a motion.
 #
 # In Blender: *File ▸ Import ▸ glTF 2.0* reads `body.glb`.
 
@@ -244,8 +245,9 @@ animate_skeletons({"three draws": motions}, category.body.skeleton, fps=moving.f
 # %% [markdown]
 # ## 7. When not to trust it
 #
-# The check compares the most probable body with the mask: no animal has the silhouette of a star. It does not see more
-# than that. A square is covered by a thick animal, and passes: a mark is a reason to look, and its absence is no proof.
+# Two checks compare the most probable body with the mask, and its shape with those of the category: no animal has the
+# silhouette of a star, and only an unusually thick one that of a square. They do not see more than that. A mark is a reason
+# to look, and its absence is no proof.
 
 # %%
 rows, columns = np.mgrid[:96, :96] - 47.5

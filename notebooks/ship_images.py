@@ -16,7 +16,7 @@ import torch
 from probmotion.data.synthetic import animal_clips, synthetic_walks, walk_clips
 from probmotion.models.bodies.turn_fit import fit_turns
 from probmotion.models.images.category import Category
-from probmotion.models.images.encoder_training import EncoderTrainee
+from probmotion.models.images.encoder_training import EncoderTrainee, encoder_of
 from probmotion.models.latent.turn_code import TurnCode
 from probmotion.models.training.checkpoints import load_checkpoint, save_checkpoint
 from probmotion.models.training.settings import TrainingSettings
@@ -36,6 +36,15 @@ TRAINING = TrainingSettings(
     halve_at=(2000, 3000, 3800, 4400),
     checkpoint_every=250,
 )
+SILHOUETTES = TrainingSettings(
+    steps=2500,
+    batch=32,
+    learning_rate=5e-4,
+    ema=0.99,
+    clip=50.0,
+    halve_at=(1000, 1600, 2000, 2300),
+    checkpoint_every=250,
+)
 
 CARD = """# {name}-images
 
@@ -49,8 +58,9 @@ encoder of {parameters:.1f} million weights.
 - **Surface, shapes and colours**: not learnt; `Category.of_capsules`. `probmotion train images`
   learns them from clips of images.
 - **Encoder**: learnt from images that are rendered from draws of the category, with errors of masks
-  and images cut off; {steps} steps of {batch} images, {minutes:.0f} minutes of one core. Its
-  negative log density of the parameters is {loss:.1f} nats on validation images (that of the prior,
+  and images cut off; {steps} steps of {batch} images, and {more} of {fewer} for the silhouettes of
+  its means, too; {minutes:.0f} minutes of one core. Its negative log density of the parameters is
+  {loss:.1f} nats on validation images, {before:.1f} before the silhouettes (that of the prior,
   without an image, is {prior:.1f}).
 - **Not for**: poses unlike those of the clips; several bodies in one mask; photographs whose colours
   matter (colours are smooth and the light is one lamp). No photograph was used.
@@ -108,10 +118,15 @@ def main() -> None:
     card = {"clips": sorted(clip.name for clip in clips), "windows": len(windows)}
     replace(category, card=card).save(WEIGHTS / f"{name}-images.npz")
     category = Category.load(name)
-    trainee = EncoderTrainee(category)
-    result = train(trainee, TRAINING, options.out, device="cpu", progress=False)
-    checkpoint = load_checkpoint(result.model, trainee.kind)
-    save_checkpoint(WEIGHTS / f"{name}-images.safetensors", checkpoint, half=True)
+    results = []
+    for settings in (TRAINING, SILHOUETTES):
+        learnt = encoder_of(category) if results else None
+        trainee = EncoderTrainee(category, learnt=learnt)
+        folder = options.out / ("silhouettes" if results else "parameters")
+        result = train(trainee, settings, folder, device="cpu", progress=False)
+        checkpoint = load_checkpoint(result.model, trainee.kind)
+        save_checkpoint(WEIGHTS / f"{name}-images.safetensors", checkpoint, half=True)
+        results.append(result.saved)
     dim = trainee.network.dim
     text = CARD.format(
         name=name,
@@ -126,8 +141,11 @@ def main() -> None:
         provenance=PROVENANCE[name],
         steps=TRAINING.steps,
         batch=TRAINING.batch,
-        minutes=result.saved["seconds"] / 60,
-        loss=result.saved["validation_loss"],
+        more=SILHOUETTES.steps,
+        fewer=SILHOUETTES.batch,
+        minutes=sum(saved["seconds"] for saved in results) / 60,
+        before=results[0]["validation_loss"],
+        loss=results[1]["validation_loss"],
         # dim − 2 normal parameters and a uniform angle of a quarter turn, one of four
         prior=(dim - 2) * 0.5 * np.log(2 * np.pi * np.e) + np.log(2 * np.pi),
     )

@@ -20,11 +20,11 @@ from probmotion.models.images.posing import Skin
 from probmotion.models.images.surface import Surface, rest_surface
 from probmotion.models.latent.turn_code import TurnCode
 from probmotion.motion.skeleton import Skeleton
-from probmotion.validation import check_finite, check_shape
+from probmotion.validation import check_finite, check_positive, check_shape
 
 __all__ = ["Category", "MotionCode", "folded", "smooth_components", "vertex_normals"]
 
-_FORMAT = 1
+_FORMAT = 2
 # Of the rest pose's size: lengths over which shapes and colours vary, and the deformations' size.
 _SHAPE_LENGTH, _COLOUR_LENGTH, _SHAPE_SPREAD = 0.2, 0.15, 0.012
 _SHAPES, _COLOURS = 6, 6
@@ -34,6 +34,8 @@ _TINTS = np.array(
     [[1, 1, 1], [1, 0.8, 0.6], [0.6, 0.9, 1.2], [1.2, 1, 0.6], [1, 1, 1], [0.8, 1, 1]]
 )
 _LENGTH_SPREAD = 0.06
+# Arrays that files contain in single precision, by attribute.
+_VALUES = ("shapes", "albedo", "albedos", "features", "feature_noise")
 _SYMMETRIC = 1e-5  # distance between mirrored vertices, of the size
 _WEIGHTS = Path(__file__).parents[1] / "weights"
 
@@ -81,6 +83,8 @@ class Category:
         Standard deviation of the logarithm of bone lengths.
     features : ndarray, (V, F)
         Mean image features of the vertices; F = 0 without.
+    feature_noise : ndarray, (F,)
+        Standard deviations of image features from those of the vertices.
     card : mapping
         Training record.
     source : Path, optional
@@ -89,7 +93,7 @@ class Category:
     Raises
     ------
     ValueError
-        If shapes disagree or a value is not finite.
+        If shapes disagree, a value is not finite, or a standard deviation is not above 0.
     """
 
     name: str
@@ -101,6 +105,7 @@ class Category:
     code: MotionCode
     length_spread: float
     features: np.ndarray
+    feature_noise: np.ndarray
     card: Mapping[str, Any] = field(default_factory=dict)
     source: Path | None = None
 
@@ -110,8 +115,17 @@ class Category:
         check_shape("albedo", self.albedo, vertices)
         check_shape("albedos", self.albedos, ("A", *vertices))
         check_shape("features", self.features, (vertices[0], "F"))
-        for name in ("shapes", "albedo", "albedos", "features"):
+        check_shape("feature_noise", self.feature_noise, self.features.shape[1:])
+        for name in _VALUES:
             check_finite(name, getattr(self, name))
+        skeleton = self.body.skeleton
+        if self.surface.joints.min() < 0 or self.surface.joints.max() >= skeleton.n_joints:
+            raise ValueError(f"joints must be of the body's {skeleton.n_joints}, got others")
+        if isinstance(self.code, TurnCode):
+            check_shape("mean", self.code.mean, ("L", len(self.body.bones), 3))
+        check_positive("length_spread", self.length_spread)
+        if (self.feature_noise <= 0).any():
+            raise ValueError(f"feature_noise must be above 0, got {self.feature_noise.min():g}")
 
     @classmethod
     def of_capsules(cls, name: str, body: ArticulatedBody, code: MotionCode) -> Category:
@@ -138,6 +152,7 @@ class Category:
             code,
             _LENGTH_SPREAD,
             np.zeros((len(vertices), 0)),
+            np.zeros(0),
         )
 
     @cached_property
@@ -147,45 +162,55 @@ class Category:
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of the arrays of rest pose, vertices, shapes, colours and code, hexadecimal."""
-        code = (self.code.mean, self.code.basis) if isinstance(self.code, TurnCode) else ()
-        arrays = (self.body.rest, self.surface.vertices, self.shapes, self.albedo, self.albedos)
-        content = hashlib.sha256()
-        for array in (*arrays, self.features, *code):
-            content.update(np.ascontiguousarray(array, dtype="<f4").tobytes())
+        """SHA-256 of all that :meth:`save` writes but the name and the card, hexadecimal."""
+        settings, arrays = self._content()
+        content = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
+        for name, array in sorted(arrays.items()):
+            content.update(f"{name} {array.dtype.str} {array.shape}".encode())
+            content.update(np.ascontiguousarray(array).tobytes())
         return content.hexdigest()
+
+    def check_features(self, features: np.ndarray | None) -> None:
+        """Raise ``ValueError`` if there are image features (…, F') that are not of F channels."""
+        known = self.features.shape[1]
+        if features is not None and features.shape[-1] != known:
+            raise ValueError(
+                f"category {self.name} must have image features of {features.shape[-1]} channels, "
+                f"got {known or 'none'}; leave the features out, or train a category on images "
+                "with such features"
+            )
 
     def save(self, path: str | Path) -> None:
         """Write the category to an ``.npz`` file for :meth:`load`.
 
         Raises ``ValueError`` if its code is not a :class:`TurnCode`.
         """
-        if not isinstance(self.code, TurnCode):
-            raise ValueError(f"code must be a TurnCode to be saved, got {type(self.code).__name__}")
-        text = {
-            "format": _FORMAT,
-            "name": self.name,
-            "joint_names": self.body.skeleton.joint_names,
-            "parents": [int(parent) for parent in self.body.skeleton.parents],
-            "fps": self.code.fps,
-            "length_spread": self.length_spread,
-            "card": dict(self.card),
-        }
-        arrays: dict[str, Any] = {
-            "rest": self.body.rest,
-            "vertices": self.surface.vertices,
-            "triangles": self.surface.triangles.astype(np.int32),
-            "joints": self.surface.joints.astype(np.int16),
-            "weights": self.surface.weights,
-            "shapes": self.shapes.astype(np.float32),
-            "albedo": self.albedo.astype(np.float32),
-            "albedos": self.albedos.astype(np.float32),
-            "features": self.features.astype(np.float32),
-            "turns_mean": self.code.mean.astype(np.float32),
-            "turns_basis": self.code.basis.astype(np.float32),
-        }
+        settings, arrays = self._content()
+        text = {"format": _FORMAT, "name": self.name, **settings, "card": dict(self.card)}
         with written_whole(Path(path)) as unfinished, unfinished.open("wb") as file:
             np.savez_compressed(file, settings=np.array(json.dumps(text)), **arrays)
+
+    def _content(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Return the settings and arrays of the file without name and card."""
+        if not isinstance(self.code, TurnCode):
+            raise ValueError(f"code must be a TurnCode to be saved, got {type(self.code).__name__}")
+        settings = {
+            "joint_names": list(self.body.skeleton.joint_names),
+            "parents": [int(parent) for parent in self.body.skeleton.parents],
+            "fps": float(self.code.fps),
+            "length_spread": float(self.length_spread),
+        }
+        arrays = {
+            "rest": self.body.rest.astype("<f8"),
+            "vertices": self.surface.vertices.astype("<f8"),
+            "triangles": self.surface.triangles.astype("<i4"),
+            "joints": self.surface.joints.astype("<i2"),
+            "weights": self.surface.weights.astype("<f8"),
+            **{name: getattr(self, name).astype("<f4") for name in _VALUES},
+            "turns_mean": self.code.mean.astype("<f4"),
+            "turns_basis": self.code.basis.astype("<f4"),
+        }
+        return settings, arrays
 
     @classmethod
     def load(cls, source: str | Path) -> Category:
@@ -215,10 +240,7 @@ class Category:
                 arrays["joints"].astype(np.int64),
                 arrays["weights"],
             )
-            named = {
-                name: arrays[name].astype(np.float64)
-                for name in ("shapes", "albedo", "albedos", "features")
-            }
+            named = {name: arrays[name].astype(np.float64) for name in _VALUES}
             mean, basis = (arrays[f"turns_{part}"].astype(np.float64) for part in ("mean", "basis"))
             return cls(
                 text["name"],

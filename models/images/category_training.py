@@ -1,4 +1,4 @@
-"""Learning of a category's mean surface and colours from images of many of its bodies."""
+"""Learning of a category's mean surface, colours and features from images of its bodies."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from probmotion.models.images.surface_prior import SurfacePrior
 from probmotion.posteriors.sampling import progress_bar
 from probmotion.validation import check_count, check_finite, check_shape
 
-__all__ = ["learn_surface"]
+__all__ = ["feature_channels", "learn_surface"]
 
 # Numbers of smooth components; of the rest pose's size, their lengths and standard deviations.
 # Movements along the normals change thickness, those along the axes proportions.
@@ -24,6 +24,7 @@ _NORMAL, _NORMAL_LENGTH, _NORMAL_SPREAD = 60, 0.12, 0.02
 _AXIS, _AXIS_LENGTH, _AXIS_SPREAD = 20, 0.25, 0.01
 _MIDPLANE = 0.04  # distance from the plane of symmetry at which vertices move sideways freely
 _COLOURS, _COLOUR_LENGTH, _COLOUR_SPREAD = 40, 0.15, 0.2
+_FEATURES, _FEATURE_LENGTH = 40, 0.15
 _SIZE = 64  # pixels of the images; larger ones are averaged
 _BATCH = 25  # largest number of images per gradient step of what is shared
 # Initial learning rates of what is shared and of θ; they fall linearly to 0.
@@ -38,7 +39,7 @@ def learn_surface(
     steps: int = 400,
     progress: bool = False,
 ) -> Category:
-    """Return the category with the mean surface and colours of the bodies in images.
+    """Return the category with the mean surface, colours and features of the bodies in images.
 
     Maximises the posterior density of a displacement of the mean surface and a change of the mean
     colours, smooth Gaussian functions that all images share, together with each image's θ. Both
@@ -46,12 +47,17 @@ def learn_surface(
     become part of the new means. The distribution of poses and the deviations of shapes and colours
     remain.
 
+    Features and their noise are then a linear regression on images of functions of the surface, a
+    constant and smooth Gaussian ones, symmetric if the surface is. They do not change the surface:
+    those of a surface with errors would keep it as it is. If the images have no features, those of
+    the category remain.
+
     Parameters
     ----------
     category : Category
         Current category.
     images : sequence of ImageObservation
-        N observations of one image each.
+        N observations of one image each, all of them with features or none.
     theta : ndarray, (N, dim)
         Parameters under the current category, as of :class:`SurfacePrior`. Poses and motion codes
         are starting values; the other coordinates, in which an image compensates for errors of
@@ -64,7 +70,8 @@ def learn_surface(
     Raises
     ------
     ValueError
-        If there are no images, an observation has several, or shapes disagree.
+        If there are no images, an observation has several, only some have features, no feature in a
+        body is known, or shapes disagree.
     """
     check_count("steps", steps)
     if not images or any(image.images != 1 for image in images):
@@ -76,7 +83,9 @@ def learn_surface(
     start = np.array(theta)
     start[:, layout.lengths.start : layout.light.stop] = 0.0
     size = min(_SIZE, *(image.size for image in images))
-    likelihoods = [ImageLikelihood.of(image, size, torch.float32) for image in images]
+    channels = feature_channels(images)
+    plain = [replace(image, features=None) for image in images]
+    likelihoods = [ImageLikelihood.of(image, size, torch.float32, np.zeros(0)) for image in plain]
     shared = _Shared(category)
     # Batches contain images of many clips, whose images follow one another.
     count = -(-len(images) // _BATCH)
@@ -100,7 +109,65 @@ def learn_surface(
             optimiser.step()
             falling.step()
             bar.update(1)
-    return shared.learnt(torch.cat(own).detach(), common.detach())
+    learnt = shared.learnt(torch.cat(own).detach(), common.detach())
+    if not channels:
+        return learnt
+    reached = [shared.joined(part, common).detach() for part in own]
+    features, noise = _regressed(shared.widened, images, batches, reached, size)
+    return replace(learnt, features=features, feature_noise=noise)
+
+
+def feature_channels(images: Sequence[ImageObservation]) -> int:
+    """Return the number of image features, 0 without.
+
+    Raises ``ValueError`` if it is not the same for all images.
+    """
+    counts = {0 if image.features is None else image.features.shape[-1] for image in images}
+    if len(counts) > 1:
+        raise ValueError(
+            "images must all have the same number of features, or all have none, got "
+            f"{' and '.join(map(str, sorted(counts)))} channels"
+        )
+    return counts.pop()
+
+
+def _regressed(
+    category: Category,
+    images: Sequence[ImageObservation],
+    batches: Sequence[np.ndarray],
+    theta: Sequence[torch.Tensor],
+    size: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the features (V, F) that explain those of images at θ of each batch, and their noise.
+
+    Images of features are linear in those of the vertices. Coefficients of the smooth functions
+    have a Gaussian prior of the features' variance, which is also the noise that it assumes.
+    """
+    vertices = category.surface.vertices
+    length = _FEATURE_LENGTH * float(np.ptp(vertices, axis=0).max())
+    smooth = smooth_components(folded(vertices), length, _FEATURES)
+    functions = np.concatenate([np.ones((1, len(vertices))), smooth]).T
+    regressors = replace(category, features=functions, feature_noise=np.ones(len(smooth) + 1))
+    k, channels, known = functions.shape[1], feature_channels(images), 0
+    products = np.zeros((k + channels, k + channels))
+    for rows, own in zip(batches, theta, strict=True):
+        prior = _ImagesPrior(regressors, np.concatenate([images[row].tangent for row in rows]))
+        with torch.no_grad():
+            rendered = prior.render(own, size, features=True)[..., 3:-1]
+        for row, image in zip(rows, rendered, strict=True):
+            observed = ImageLikelihood.of(images[row], size, torch.float32, np.ones(channels))
+            values = torch.cat([image, observed.features], dim=-1)
+            values = values[observed.described.all(dim=-1)].double()
+            products += (values.T @ values).numpy()
+            known += len(values)
+    if not known:
+        raise ValueError("images must have features inside their masks, got only unknown ones")
+    penalty = np.diag([1e-6, *np.ones(k - 1)]) / observed.weight  # the constant is free
+    weights = np.linalg.solve(products[:k, :k] + penalty, products[:k, k:])
+    errors = np.concatenate([-weights, np.eye(channels)])
+    noise = np.sqrt(np.einsum("kf,kl,lf->f", errors, products, errors).clip(min=0) / known)
+    # A channel that is 0 everywhere says nothing, whatever its noise.
+    return functions @ weights, np.where(noise > 0, noise, 1.0)
 
 
 class _Shared:
@@ -159,11 +226,12 @@ class _ImagesPrior(SurfacePrior):
         super().__init__(category, tangents[:1])
         self.tangent = tangents[:, None]
 
-    def render(self, theta: torch.Tensor, size: int) -> torch.Tensor:
+    def render(self, theta: torch.Tensor, size: int, features: bool = False) -> torch.Tensor:
         p = self.parameters(theta)
         vertices = self._posed(p)[:, 0]
         triangles = self.category.surface.triangles
         colours = shaded(vertices, triangles, p.albedo, p.light, p.ambient)
+        colours = self._with_features(colours) if features else colours
         # One camera sees the same images if bodies are stretched across its axis.
         tangent = float(self.tangent.mean())
         stretch = torch.ones(len(vertices), 1, 3, dtype=theta.dtype)

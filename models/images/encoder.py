@@ -14,7 +14,15 @@ import numpy as np
 
 from probmotion.extras import nn, torch
 
-__all__ = ["QUARTERS", "SIZE", "EncoderNetwork", "Estimates", "encoder_input", "quarter_of"]
+__all__ = [
+    "QUARTERS",
+    "SIZE",
+    "EncoderNetwork",
+    "Estimates",
+    "encoder_input",
+    "parameters_of",
+    "quarter_of",
+]
 
 QUARTERS = 4
 """Number of facing directions, at quarter turns from the camera."""
@@ -89,6 +97,17 @@ def encoder_input(mask: np.ndarray, rgb: np.ndarray | None) -> torch.Tensor:
     if images.shape[-1] % SIZE:
         raise ValueError(f"mask must have a multiple of {SIZE} pixels a side, got {mask.shape[-1]}")
     return nn.functional.avg_pool2d(images, images.shape[-1] // SIZE)
+
+
+def parameters_of(values: torch.Tensor, quarter: torch.Tensor, view: int) -> torch.Tensor:
+    """Return θ (B, dim) of one image from values (B, dim − 1) of estimates given the quarters (B,).
+
+    θ has its first coordinate of the view at ``view``.
+    """
+    yaw = quarter.to(values.dtype) * (math.pi / 2) + values[:, 0]
+    # The root mean square length of the two coordinates.
+    direction = math.sqrt(2) * torch.stack([torch.sin(yaw), torch.cos(yaw)], dim=1)
+    return torch.cat([values[:, 1 : view + 1], direction, values[:, view + 1 :]], dim=1)
 
 
 def quarter_of(yaw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from probmotion.models.images.encoder import (
     EncoderNetwork,
     Estimates,
     encoder_input,
+    parameters_of,
     quarter_of,
 )
 from probmotion.models.images.made_images import make_images
@@ -35,13 +37,16 @@ KIND = "image-encoder"
 TANGENTS = (0.05, 0.35)
 """Range of the tangents of half the crops' fields of view."""
 _GREY = 0.2  # share of inputs without colours
+_SILHOUETTE, _RENDERED = 100.0, 32  # weight of the IoU in the loss, nats, and pixels of silhouettes
 _VALIDATED = 256
 
 
 class EncoderTrainee:
     """Trainee for :func:`~probmotion.models.training.trainer.train`.
 
-    The loss is the negative log density of the true parameters under the network's mixture.
+    The loss is the negative log density of the true parameters under the network's mixture. For a
+    network that has learnt this, it also has 1 − IoU of the observed silhouette and that of the
+    mean given the true quarter turn; from the beginning, this slows down learning.
 
     Parameters
     ----------
@@ -49,28 +54,42 @@ class EncoderTrainee:
         Kind of body; its draws are rendered.
     seed : int
         Seed of the initial weights and of the validation images.
+    learnt : EncoderNetwork, optional
+        Network of this category that is trained further, for silhouettes, too.
     """
 
     kind = KIND
 
-    def __init__(self, category: Category, seed: int = 0) -> None:
-        self.category = category
+    def __init__(
+        self, category: Category, seed: int = 0, learnt: EncoderNetwork | None = None
+    ) -> None:
+        # The network sees no features.
+        without = category.features[:, :0]
+        self.category = replace(category, features=without, feature_noise=np.zeros(0))
         dim = SurfacePrior(category, np.ones(1)).dim
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seeds.integer(seed, "weights"))
             self.network = EncoderNetwork(dim)
         self.settings: Mapping[str, Any] = {"category": category.digest, "dim": dim, "seed": seed}
-        self._validation = self._batch(seeds.generator(seed, "validation"), _VALIDATED)
+        self._silhouettes = learnt is not None
+        if learnt is not None:
+            self.network.load_state_dict(learnt.state_dict())
+            self.settings = {**self.settings, "silhouettes": _SILHOUETTE}
+        self._validation = self._batch(seeds.generator(seed, "validation"), _VALIDATED)[:2]
 
     def training_loss(
         self, network: nn.Module, rng: np.random.Generator, batch: int, device: torch.device
     ) -> torch.Tensor:
         """Return the loss of new images."""
-        images, theta = self._batch(rng, batch)
-        return mixture_loss(network(images.to(device)), theta, self._view)
+        images, theta, prior = self._batch(rng, batch)
+        estimates = network(images.to(device))
+        loss = mixture_loss(estimates, theta, self._view)
+        if self._silhouettes:
+            loss = loss + _SILHOUETTE * (1 - _mean_overlap(estimates, images, theta, prior))
+        return loss
 
     def validation_loss(self, network: nn.Module, device: torch.device) -> float:
-        """Return the loss of the validation images."""
+        """Return the negative log density of the parameters of the validation images."""
         network.eval()
         with torch.no_grad():
             images, theta = self._validation
@@ -82,13 +101,30 @@ class EncoderTrainee:
     def _view(self) -> int:
         return SurfacePrior(self.category, np.ones(1)).layout.view.start
 
-    def _batch(self, rng: np.random.Generator, n: int) -> tuple[torch.Tensor, np.ndarray]:
+    def _batch(
+        self, rng: np.random.Generator, n: int
+    ) -> tuple[torch.Tensor, np.ndarray, SurfacePrior]:
         tangent = np.exp(rng.uniform(*np.log(TANGENTS)))
-        made = make_images(SurfacePrior(self.category, np.array([tangent])), rng, n, SIZE)
+        prior = SurfacePrior(self.category, np.array([tangent]))
+        made = make_images(prior, rng, n, SIZE)
         images = encoder_input(made.mask, made.rgb)
         grey = torch.as_tensor(rng.random(n) < _GREY)
         blank = encoder_input(made.mask, None)
-        return torch.where(grey[:, None, None, None], blank, images), made.theta
+        return torch.where(grey[:, None, None, None], blank, images), made.theta, prior
+
+
+def _mean_overlap(
+    estimates: Estimates, images: torch.Tensor, theta: np.ndarray, prior: SurfacePrior
+) -> torch.Tensor:
+    """Return the mean IoU of the masks of images and the silhouettes of means."""
+    view = prior.layout.view.start
+    quarter, _ = quarter_of(np.arctan2(theta[:, view], theta[:, view + 1]))
+    means = estimates.means[torch.arange(len(theta)), torch.as_tensor(quarter)].cpu()
+    rendered = prior.render(parameters_of(means, torch.as_tensor(quarter), view), _RENDERED)
+    mask, known = nn.functional.avg_pool2d(images[:, :2], SIZE // _RENDERED).unbind(1)
+    covered = rendered[:, 0, ..., -1].clamp(0.0, 1.0) * known
+    both = (covered * mask).sum(dim=(1, 2))
+    return (both / (covered + mask - covered * mask).sum(dim=(1, 2))).mean()
 
 
 def mixture_loss(estimates: Estimates, theta: np.ndarray, view: int) -> torch.Tensor:

@@ -15,8 +15,16 @@ from probmotion.extras import torch
 from probmotion.models.images.category import Category, folded, smooth_components, vertex_normals
 from probmotion.models.images.observation import ImageObservation
 from probmotion.models.images.surface_prior import SurfacePrior
+from probmotion.validation import check_count
 
-__all__ = ["MARGIN", "MadeImages", "make_category", "make_clips", "make_images"]
+__all__ = [
+    "MARGIN",
+    "MadeImages",
+    "make_category",
+    "make_clips",
+    "make_images",
+    "with_made_features",
+]
 
 MARGIN = 1.25
 """Width of a crop, of the larger side of the body's bounding box."""
@@ -27,6 +35,7 @@ _JITTER = 0.03  # standard deviation of the middle and log size of the box, of i
 _EDGE = 0.2  # standard deviation of errors of the mask's outline, in units of blurred coverage
 _BLUR = 0.01  # of the crop
 _SMOOTH = 0.02  # their correlation length, of the crop
+_PART, _FEATURE_NOISE = 0.2, 0.5  # length over which features vary, of the size, and their noise
 _TANGENTS = (0.05, 0.35)  # of clips' crops
 # Made categories: standard deviations of the logarithm of the distance from the bones, of
 # displacements (of the size), of the coat's pattern, and the range of its mean.
@@ -34,11 +43,15 @@ _THICKNESS, _DISPLACEMENT, _PATTERN, _TINT = 0.35, 0.008, 0.15, 0.15
 
 
 class MadeImages(NamedTuple):
-    """θ (n, dim), masks (n, S, S) with NaN beyond the border, colours (n, S, S, 3)."""
+    """θ (n, dim), masks (n, S, S) with NaN beyond the border, colours (n, S, S, 3).
+
+    Features (n, S, S, F) are those of the vertices with the category's noise; None if it has none.
+    """
 
     theta: np.ndarray
     mask: np.ndarray
     rgb: np.ndarray
+    features: np.ndarray | None
 
 
 def make_images(
@@ -50,7 +63,8 @@ def make_images(
 ) -> MadeImages:
     """Return ``n`` images of draws of a prior of one image, or of given θ moved into the crop.
 
-    A quarter of them is cut off at one side. Outlines of masks have smooth random errors.
+    A quarter of them is cut off at one side. Outlines of masks have smooth random errors, and
+    features smooth noise. Masks and colours do not depend on whether there are features.
     """
     theta = prior.initial(rng, n) if theta is None else np.array(theta)
     cut = np.where(rng.random(n) < _CUT, rng.uniform(0.05, _MOST_CUT, n), 0.0)
@@ -72,28 +86,34 @@ def make_images(
             middle = 0.5 * (low + high) + jitter[:, :2] * size_of_box[:, None]
             half = 0.5 * MARGIN * size_of_box * np.exp(jitter[:, 2])
             theta = prior.moved(theta, -middle, half)
-        images = prior.render(torch.as_tensor(theta, dtype=torch.float32), size)[:, 0].numpy()
+        rows = torch.as_tensor(theta, dtype=torch.float32)
+        images = prior.render(rows, size, prior.category.features.shape[1] > 0)[:, 0].numpy()
         low, high = _boxes(prior, vertices + prior.middle(theta)[:, None])
     noise = rng.standard_normal((n, size, size))
     noise = ndimage.gaussian_filter(noise, (0, _SMOOTH * size, _SMOOTH * size))
     noise = np.clip(noise * _EDGE / noise.std(), -0.4, 0.4)  # no holes, no islands
-    coverage = images[..., 3]
+    coverage = images[..., -1]
     blur = _BLUR * size
     outline = ndimage.gaussian_filter(coverage, (0, blur, blur)) + noise
     mask = np.clip(4.0 * (outline - 0.5) + 0.5, 0.0, 1.0)
-    rgb = images[..., :3] / np.maximum(coverage, 0.05)[..., None]
+    values = images[..., :-1] / np.maximum(coverage, 0.05)[..., None]
     centres = 2 * (np.arange(size) + 0.5) / size - 1
     for k in np.flatnonzero(cut > 0).tolist():
         axis = side[k] % 2
         length = high[k, axis] - low[k, axis]
-        beyond = (
+        outside = (
             centres < low[k, axis] + cut[k] * length
             if side[k] < 2
             else centres > high[k, axis] - cut[k] * length
         )
-        mask[k][(slice(None), beyond) if axis == 0 else beyond] = np.nan
-    rgb = np.where(np.isnan(mask)[..., None], np.nan, np.clip(rgb, 0.0, 1.0))
-    return MadeImages(theta, mask, rgb)
+        mask[k][(slice(None), outside) if axis == 0 else outside] = np.nan
+    beyond = np.isnan(mask)[..., None]
+    rgb = np.where(beyond, np.nan, np.clip(values[..., :3], 0.0, 1.0))
+    features = None
+    if values.shape[3] > 3:
+        features = values[..., 3:] + _feature_errors(prior.category, rng.spawn(1)[0], n, size)
+        features = np.where(beyond, np.nan, features).astype(np.float32)
+    return MadeImages(theta, mask, rgb, features)
 
 
 def make_category(category: Category, rng: np.random.Generator) -> Category:
@@ -119,6 +139,22 @@ def make_category(category: Category, rng: np.random.Generator) -> Category:
     return replace(category, surface=surface, albedo=np.clip(coat, 0.05, 0.95))
 
 
+def with_made_features(category: Category, n: int = 8) -> Category:
+    """Return a category with ``n`` features that tell parts of the body apart.
+
+    Features are smooth functions of the rest pose, uncorrelated over the vertices with mean 0 and
+    variance 1. Like those of networks, they do not tell left from right if the body is symmetric.
+    Their noise has a standard deviation of .5.
+    """
+    check_count("n", n)
+    vertices = category.surface.vertices
+    length = _PART * float(np.ptp(vertices, axis=0).max())
+    functions = smooth_components(folded(vertices), length, n)
+    unit, factors = np.linalg.qr((functions - functions.mean(axis=1, keepdims=True)).T)
+    features = np.sqrt(len(vertices)) * np.sign(np.diag(factors)) * unit
+    return replace(category, features=features, feature_noise=np.full(n, _FEATURE_NOISE))
+
+
 def make_clips(
     category: Category, rng: np.random.Generator, n: int, frames: int, size: int
 ) -> tuple[list[ImageObservation], np.ndarray]:
@@ -134,10 +170,20 @@ def make_clips(
         own = slice(prior.layout.lengths.start, prior.layout.light.stop)
         theta[:, own] = theta[0, own]
         made = make_images(prior, rng, frames, size, theta)
-        for mask, rgb in zip(made.mask, made.rgb, strict=True):
-            images.append(ImageObservation(mask[None], rgb[None], None, tangent, np.eye(3)[None]))
+        for k in range(frames):
+            features = None if made.features is None else made.features[k : k + 1]
+            seen = (made.mask[k : k + 1], made.rgb[k : k + 1], features)
+            images.append(ImageObservation(*seen, tangent, np.eye(3)[None]))
         parameters.append(made.theta)
     return images, np.concatenate(parameters)
+
+
+def _feature_errors(category: Category, rng: np.random.Generator, n: int, size: int) -> np.ndarray:
+    """Return noise of features (n, size, size, F), with the correlation length of the mask's."""
+    noise = rng.standard_normal((n, size, size, len(category.feature_noise)))
+    noise = ndimage.gaussian_filter(noise, (0, _SMOOTH * size, _SMOOTH * size, 0))
+    scaled: np.ndarray = noise * category.feature_noise / noise.std()
+    return scaled
 
 
 def _bone_distances(category: Category) -> np.ndarray:

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from probmotion.extras import drjit as dr, mitsuba as mi, torch
+from probmotion.extras import drjit as dr, mitsuba as mi, nn, torch
 from probmotion.validation import check_count, check_finite, check_positive, check_shape
 
 __all__ = ["MitsubaRenderer"]
@@ -68,15 +68,23 @@ class MitsubaRenderer:
         tangent: float,
         size: int,
     ) -> torch.Tensor:
-        """Return images (B, size, size, 4), as ``Renderer.render`` of the rasteriser's module."""
+        """Return images (B, size, size, C + 1), as ``Renderer.render`` of the rasteriser's module.
+
+        Rays are traced once for every three channels.
+        """
         check_shape("vertices", vertices, ("B", "V", 3))
         check_finite("vertices", vertices.detach())
-        check_shape("colours", colours, tuple(vertices.shape))
+        check_shape("colours", colours, (*vertices.shape[:2], "C"))
+        check_count("channels of colours", colours.shape[2])
         check_positive("tangent", tangent)
         check_count("size", size)
         with _variant():
             view = _View(triangles, tangent, size, self.samples)
-        return _Render.apply(vertices, colours, view)
+        channels = colours.shape[2]
+        padded = nn.functional.pad(colours, (0, -channels % 3))
+        images = [_Render.apply(vertices, three, view) for three in padded.split(3, dim=2)]
+        seen = torch.cat([image[..., :3] for image in images], dim=-1)[..., :channels]
+        return torch.cat([seen, images[0][..., 3:]], dim=-1)
 
 
 class _Render(torch.autograd.Function):

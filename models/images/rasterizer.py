@@ -34,7 +34,7 @@ class Renderer(Protocol):
         tangent: float,
         size: int,
     ) -> torch.Tensor:
-        """Return images (B, size, size, 4): colours times coverage, and coverage.
+        """Return images (B, size, size, C + 1): colours times coverage, and coverage.
 
         Differentiable with respect to vertices and colours.
 
@@ -44,8 +44,8 @@ class Renderer(Protocol):
             Camera coordinates of a closed mesh, metres: x right, y down, z forward.
         triangles : ndarray, (T, 3)
             Vertices of each triangle, counterclockwise from outside.
-        colours : Tensor, (B, V, 3)
-            Radiance of each vertex.
+        colours : Tensor, (B, V, C)
+            C ≥ 1 values of each vertex, such as the radiance of red, green and blue.
         tangent : float
             Tangent of half the field of view.
         size : int
@@ -64,12 +64,13 @@ class Rasterizer:
         tangent: float,
         size: int,
     ) -> torch.Tensor:
-        """Return images (B, size, size, 4), as :meth:`Renderer.render`.
+        """Return images (B, size, size, C + 1), as :meth:`Renderer.render`.
 
         Triangles with a vertex behind the camera are not drawn.
         """
         check_shape("vertices", vertices, ("B", "V", 3))
-        check_shape("colours", colours, tuple(vertices.shape))
+        check_shape("colours", colours, (*vertices.shape[:2], "C"))
+        check_count("channels of colours", colours.shape[2])
         check_positive("tangent", tangent)
         check_count("size", size)
         depth = vertices[..., 2]
@@ -156,8 +157,8 @@ def _visible(
     screen: np.ndarray, inverse: np.ndarray, colours: np.ndarray, triangles: np.ndarray, size: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return images without antialiasing, the visible triangles, −1 for none, and 1 / depth."""
-    n = len(screen)
-    image = np.zeros((n, size, size, 4))
+    n, channels = len(screen), colours.shape[2]
+    image = np.zeros((n, size, size, channels + 1))
     faces = np.full((n, size, size), -1, dtype=np.int64)
     nearness = np.zeros((n, size, size))
     for i in range(n):
@@ -186,13 +187,13 @@ def _visible(
                     if near > nearness[i, row, column]:
                         nearness[i, row, column] = near
                         faces[i, row, column] = t
-                        for k in range(3):
+                        for k in range(channels):
                             image[i, row, column, k] = (
                                 u * inverse[i, a] * colours[i, a, k]
                                 + v * inverse[i, b] * colours[i, b, k]
                                 + w * inverse[i, c] * colours[i, c, k]
                             ) / near
-                        image[i, row, column, 3] = 1.0
+                        image[i, row, column, channels] = 1.0
     return image, faces, nearness
 
 
@@ -209,7 +210,7 @@ def _visible_back(
     faces: np.ndarray,
 ) -> None:
     """Add the gradients of the visible colours with respect to vertices and their colours."""
-    weight, slope = np.empty(3), np.empty((3, 2))
+    weight, slope, change = np.empty(3), np.empty((3, 2)), np.empty(3)
     for i in range(len(screen)):
         for row in range(faces.shape[1]):
             for column in range(faces.shape[2]):
@@ -232,22 +233,22 @@ def _visible_back(
                 near = 0.0
                 for k in range(3):
                     near += weight[k] * inverse[i, triangle[k]]
-                for k in range(3):
+                change[:] = 0.0
+                for q in range(colours.shape[2]):
                     # Derivatives of Σ b z⁻¹ c / Σ b z⁻¹
+                    g, mean = gradient[i, row, column, q], 0.0
+                    for k in range(3):
+                        mean += weight[k] * inverse[i, triangle[k]] * colours[i, triangle[k], q]
+                    for k in range(3):
+                        j = triangle[k]
+                        change[k] += g * (colours[i, j, q] - mean / near)
+                        of_colours[i, j, q] += g * weight[k] * inverse[i, j] / near
+                for k in range(3):
                     j = triangle[k]
-                    change = 0.0
-                    for q in range(3):
-                        mean = 0.0
-                        for m in range(3):
-                            mean += weight[m] * inverse[i, triangle[m]] * colours[i, triangle[m], q]
-                        change += gradient[i, row, column, q] * (colours[i, j, q] - mean / near)
-                        of_colours[i, j, q] += (
-                            gradient[i, row, column, q] * weight[k] * inverse[i, j] / near
-                        )
-                    of_inverse[i, j] += change * weight[k] / near
+                    of_inverse[i, j] += change[k] * weight[k] / near
                     for m in range(3):
                         # Moving vertex m by δ changes b_k by −b_m ∇b_k δ.
-                        factor = -change * inverse[i, j] / near * weight[m]
+                        factor = -change[k] * inverse[i, j] / near * weight[m]
                         moved[i, triangle[m], 0] += factor * slope[k, 0]
                         moved[i, triangle[m], 1] += factor * slope[k, 1]
 
@@ -377,18 +378,19 @@ def _blend(
     An edge in the inner half covers part of the pixel inside, in the outer half part of the one
     outside, with the colour of the edge.
     """
+    channels = colours.shape[2]
     for n in range(len(places)):
         i, e, _, y, x, v, u = places[n]
         t, s, share = values[n]
         one, two = edges[e, 0], edges[e, 1]
         near0, near1 = (1 - s) * inverse[i, one], s * inverse[i, two]
-        for k in range(4):
+        for k in range(channels + 1):
             if t < 0.5:
                 change = plain[i, v, u, k] - plain[i, y, x, k]
                 image[i, y, x, k] += share * (0.5 - t) * change
                 continue
             colour = 1.0
-            if k < 3:
+            if k < channels:
                 colour = near0 * colours[i, one, k] + near1 * colours[i, two, k]
                 colour /= near0 + near1
             image[i, v, u, k] += share * (t - 0.5) * (colour - plain[i, v, u, k])
@@ -410,6 +412,7 @@ def _blend_back(
     values: np.ndarray,
 ) -> None:
     """Add the gradients of :func:`_blend` with respect to unblended pixels and vertices."""
+    channels = colours.shape[2]
     for n in range(len(places)):
         i, e, axis, y, x, v, u = places[n]
         t, s, share = values[n]
@@ -420,7 +423,7 @@ def _blend_back(
         of_t, of_s, of_share = 0.0, 0.0, 0.0
         near0, near1 = (1 - s) * inverse[i, one], s * inverse[i, two]
         near = near0 + near1
-        for k in range(4):
+        for k in range(channels + 1):
             if t < 0.5:
                 g = gradient[i, y, x, k]
                 change = plain[i, v, u, k] - plain[i, y, x, k]
@@ -431,7 +434,7 @@ def _blend_back(
                 continue
             g = gradient[i, v, u, k]
             colour = 1.0
-            if k < 3:
+            if k < channels:
                 c0, c1 = colours[i, one, k], colours[i, two, k]
                 colour = (near0 * c0 + near1 * c1) / near
                 factor = g * share * (t - 0.5)

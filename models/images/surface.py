@@ -13,7 +13,7 @@ from probmotion.models.bodies.body_states import trunk_joints
 from probmotion.models.images._capsule_union import CapsuleUnion
 from probmotion.models.images._remeshing import border_of, remeshed
 from probmotion.motion.skeleton import Skeleton
-from probmotion.validation import check_count
+from probmotion.validation import check_count, check_finite, check_shape
 
 __all__ = ["Surface", "rest_surface"]
 
@@ -23,6 +23,7 @@ _THIN = 0.02  # smallest radius of a capsule
 _SOFT = 0.008  # length over which capsules, and the movements of bones, blend
 _INFLUENCES = 4  # bones that move a vertex
 _SMALL = 1e-3  # weights below are set to 0
+_SUM = 1e-4  # deviation of the sum of weights from 1
 _TOLERANCE = 0.1  # relative deviation from the requested number of vertices
 _FLIP = np.array([-1.0, 1.0, 1.0])
 
@@ -41,12 +42,30 @@ class Surface:
         Lower joints of the bones that move a vertex, 0 where the weight is 0.
     weights : ndarray, (V, 4)
         Weights of these bones, descending, sums 1.
+
+    Raises
+    ------
+    ValueError
+        If a shape or value is other than these.
     """
 
     vertices: np.ndarray
     triangles: np.ndarray
     joints: np.ndarray
     weights: np.ndarray
+
+    def __post_init__(self) -> None:
+        check_shape("vertices", self.vertices, ("V", 3))
+        check_finite("vertices", self.vertices)
+        check_shape("triangles", self.triangles, ("T", 3))
+        count = len(self.vertices)
+        if not np.isin(self.triangles, range(count)).all():
+            raise ValueError(f"triangles must be of vertices 0 to {count - 1}, got others")
+        check_shape("joints", self.joints, (count, _INFLUENCES))
+        check_shape("weights", self.weights, (count, _INFLUENCES))
+        check_finite("weights", self.weights)
+        if self.weights.min() < 0 or np.abs(self.weights.sum(axis=1) - 1).max() > _SUM:
+            raise ValueError("weights must be at least 0 with sums 1, got others")
 
 
 def rest_surface(body: ArticulatedBody, vertices: int = 700) -> Surface:

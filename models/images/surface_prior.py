@@ -158,10 +158,11 @@ class SurfacePrior(StandardNormalPrior):
         """Return the surface in each image's camera axes, ``(B, dim) → (B, T, V, 3)``, metres."""
         return self._seen(self._posed(self.parameters(theta)))
 
-    def render(self, theta: torch.Tensor, size: int) -> torch.Tensor:
+    def render(self, theta: torch.Tensor, size: int, features: bool = False) -> torch.Tensor:
         """Return the images, ``(B, dim) → (B, T, size, size, 4)``.
 
-        The channels are colours times coverage, and coverage.
+        The channels are colours times coverage, and coverage. With ``features``, the category's
+        features times coverage are between them, (B, T, size, size, 4 + F).
         """
         p = self.parameters(theta)
         vertices = self._posed(p)
@@ -170,6 +171,7 @@ class SurfacePrior(StandardNormalPrior):
         images = []
         for t, tangent in enumerate(self.tangent):
             colours = shaded(vertices[:, t], triangles, p.albedo, p.light, p.ambient)
+            colours = self._with_features(colours) if features else colours
             image = self.renderer.render(seen[:, t], triangles, colours, float(tangent), size)
             images.append(image)
         return torch.stack(images, dim=1)
@@ -189,6 +191,7 @@ class SurfacePrior(StandardNormalPrior):
                 "likelihood must be of images with the prior's rotation, got a difference of "
                 f"{difference:.2g} between the axes of two crops; give rotation to SurfacePrior"
             )
+        self.category.check_features(likelihood.features)
 
     def log_likelihood(self, theta: Array, likelihood: ImageObservation) -> Array:
         """Return log p(images | θ) but for a constant: ``(…, dim) → (…)``."""
@@ -196,8 +199,11 @@ class SurfacePrior(StandardNormalPrior):
         rows = torch.as_tensor(theta).reshape(-1, self.dim)
         with torch.set_grad_enabled(isinstance(theta, torch.Tensor) and torch.is_grad_enabled()):
             size = min(likelihood.size, _SIZE)
-            density = ImageLikelihood.of(likelihood, size, rows.dtype)
-            parts = [density.log_density(self.render(part, size)) for part in rows.split(_ROWS)]
+            density = ImageLikelihood.of(likelihood, size, rows.dtype, self.category.feature_noise)
+            features = likelihood.features is not None
+            parts = [
+                density.log_density(self.render(part, size, features)) for part in rows.split(_ROWS)
+            ]
         values = torch.cat(parts).reshape(theta.shape[:-1])
         return values if isinstance(theta, torch.Tensor) else to_numpy(values)
 
@@ -299,6 +305,11 @@ class SurfacePrior(StandardNormalPrior):
     def _seen(self, vertices: torch.Tensor) -> torch.Tensor:
         """Return vertices (B, T, V, 3) in the axes of each camera."""
         return vertices @ torch.as_tensor(self.turned, dtype=vertices.dtype).mT
+
+    def _with_features(self, colours: torch.Tensor) -> torch.Tensor:
+        """Return colours (B, V, 3) and the category's features, (B, V, 3 + F)."""
+        features = torch.as_tensor(self.category.features, dtype=colours.dtype)
+        return torch.cat([colours, features.expand(len(colours), -1, -1)], dim=-1)
 
 
 def _flip(dtype: torch.dtype) -> torch.Tensor:

@@ -163,7 +163,7 @@ class Reconstruct:
     """Reconstruct an animal or person from one image or the images of a clip, in 3D and motion.
 
     Writes to --out: reconstruct.html (the images, other views and posterior draws in motion),
-    body.glb (coloured surface with a skeleton and a motion, for Blender), reconstruction.npz (the
+    body.glb (textured surface with a skeleton and a motion, for Blender), reconstruction.npz (the
     motion and all draws) and summary.json.
     """
 
@@ -174,8 +174,8 @@ class Reconstruct:
     """Mask of the body, one for each image; the image's opacity by default."""
 
     features: tuple[Path, ...] = ()
-    """Image features (.npz, one array of rows, columns and channels), one file for each image. They
-    are read and checked, but not used yet."""
+    """Image features (.npz, one array of rows, columns and channels), one file for each image, for
+    a category that was trained with such features."""
 
     category: str
     """Kind of body: quadruped, person, or the file of a trained category."""
@@ -205,6 +205,7 @@ class Reconstruct:
             features=_one_or_all(self.features) if self.features else None,
             fov=self.fov,
         )
+        category.check_features(observation.features)
         writable_folder(self.out)
         result = reconstruct(observation, category, draws=self.draws, seed=self.seed)
         result.save(self.out)

@@ -180,14 +180,16 @@ class TrainImages:
     """Category to start from: quadruped, person, or the file of a category."""
 
     clips: tuple[Path, ...] = ()
-    """Folders of clips with images/NAME.png (or .jpg) and masks/NAME.png.
+    """Folders of clips with images/NAME.png (or .jpg), masks/NAME.png and, in all clips or none,
+    features/NAME.npz (image features: one array of rows, columns and channels).
     Default: generated images of an animal with another surface and coat."""
 
     images: int = 200
     """Number of images to learn from, evenly spread over the clips."""
 
     rounds: int = 2
-    """Number of rounds; each estimates all poses (3 s per image), then surface and colours."""
+    """Number of rounds; each estimates all poses (3 s per image), then surface, colours and
+    features."""
 
     fov: float = 40.0
     """Field of view of the clips' cameras along the longer side, degrees."""
@@ -252,8 +254,11 @@ class TrainImages:
             if not share:
                 continue
             chosen = np.unique(np.linspace(0, len(clip) - 1, share).round().astype(int))
-            for image, mask in (clip[k] for k in chosen):
-                images.append(ImageObservation.read(image, mask, fov=self.fov, size=_SIZE))
+            for image, mask, features in (clip[k] for k in chosen):
+                seen = ImageObservation.read(
+                    image, mask, features=features, fov=self.fov, size=_SIZE
+                )
+                images.append(seen)
         return images
 
     def _start_encoder(self, start: Category, settings: TrainingSettings) -> EncoderNetwork:
@@ -274,30 +279,34 @@ class TrainImages:
             return load_encoder(folder, start)
 
 
-def _masked_images(folder: Path) -> list[tuple[Path, Path]]:
-    """Return the images of a clip and their masks, sorted by name."""
+def _masked_images(folder: Path) -> list[tuple[Path, Path, Path | None]]:
+    """Return the images of a clip, their masks and features if it has any, sorted by name."""
+    suffixes = {"images": {".png", ".jpg", ".jpeg"}, "masks": {".png"}, "features": {".npz"}}
+    if not (folder / "features").is_dir():
+        del suffixes["features"]
     found: dict[str, dict[str, Path]] = {}
-    for part in ("images", "masks"):
-        suffixes = {".png", ".jpg", ".jpeg"} if part == "images" else {".png"}
+    for part, allowed in suffixes.items():
         if not (folder / part).is_dir():
             raise ValueError(f"clips must be folders with images and masks, got no {folder / part}")
         files = [
-            path for path in sorted((folder / part).iterdir()) if path.suffix.lower() in suffixes
+            path for path in sorted((folder / part).iterdir()) if path.suffix.lower() in allowed
         ]
         found[part] = {path.stem: path for path in files}
         if not files:
             raise ValueError(
-                f"clips must contain {' or '.join(sorted(suffixes))}, got none in {folder / part}"
+                f"clips must contain {' or '.join(sorted(allowed))}, got none in {folder / part}"
             )
         if len(found[part]) < len(files):
             raise ValueError(f"images of a clip must have unique names, got two in {folder / part}")
-    images, masks = found["images"], found["masks"]
-    if odd := sorted(images.keys() ^ masks.keys()):
-        raise ValueError(
-            f"images and masks of a clip must have the same names, got {odd[0]} in only one of the "
-            f"folders of {folder}"
-        )
-    return [(images[name], masks[name]) for name in images]
+    images = found.pop("images")
+    for part, others in found.items():
+        if odd := sorted(images.keys() ^ others.keys()):
+            raise ValueError(
+                f"images and {part} of a clip must have the same names, got {odd[0]} in only one "
+                f"of the folders of {folder}"
+            )
+    features = found.get("features", {})
+    return [(images[name], found["masks"][name], features.get(name)) for name in images]
 
 
 def _learning_clips(

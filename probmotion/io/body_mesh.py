@@ -11,7 +11,7 @@ from probmotion.motion.rest_poses import is_four_legged
 from probmotion.motion.skeleton import Skeleton
 from probmotion.motion.t_pose import person_joints
 
-__all__ = ["BodyMesh", "Part", "body_mesh", "body_parts"]
+__all__ = ["BodyMesh", "Part", "Texture", "body_mesh", "body_parts"]
 
 _AROUND = 14  # vertices of a ring
 _CAP, _TUBE = 3, 7  # rings of a cap and of the tube
@@ -93,6 +93,13 @@ class _Figure(NamedTuple):
     axes: np.ndarray  # (3, 3), rows left, up and forward
 
 
+class Texture(NamedTuple):
+    """Image that is laid on N vertices: the reflectance of the surface."""
+
+    image: np.ndarray  # (H, W, 3), red, green and blue, uint8, sRGB
+    coordinates: np.ndarray  # (N, 2), right and down, 0 to 1 from edge to edge of the image
+
+
 class BodyMesh(NamedTuple):
     """Triangles in the rest pose, and up to four joints that move each of the N vertices."""
 
@@ -101,7 +108,7 @@ class BodyMesh(NamedTuple):
     triangles: np.ndarray  # (T, 3)
     joints: np.ndarray  # (N, 4), 0 where the weight is 0
     weights: np.ndarray  # (N, 4), sums 1
-    colours: np.ndarray | None = None  # (N, 3), linear red, green and blue in [0, 1]
+    texture: Texture | None = None
 
 
 class Part(NamedTuple):

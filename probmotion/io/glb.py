@@ -5,16 +5,18 @@ Source: The Khronos Group, *glTF 2.0 specification* (2021).
 
 from __future__ import annotations
 
+import io
 import json
 import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from probmotion.files import written_whole
 from probmotion.geometry.rotations import matrix_to_quaternion
-from probmotion.io.body_mesh import BodyMesh, body_mesh
+from probmotion.io.body_mesh import BodyMesh, Texture, body_mesh
 from probmotion.motion.inverse_kinematics import rigid_motion
 from probmotion.motion.motion import Motion
 from probmotion.motion.rest_poses import joint_positions
@@ -24,9 +26,9 @@ __all__ = ["write_glb"]
 
 _FLOAT, _SHORT, _INT = 5126, 5123, 5125  # component types
 _VERTICES, _INDICES = 34962, 34963  # buffer view targets
-_COMPONENTS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
+_LINEAR, _CLAMP = 9729, 33071  # filter and wrapping of textures
+_COMPONENTS = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 _COLOUR = [0.42, 0.53, 0.68, 1.0]
-_WHITE = [1.0, 1.0, 1.0, 1.0]
 
 
 def write_glb(motion: Motion, path: str | Path, mesh: BodyMesh | None = None) -> None:
@@ -45,7 +47,7 @@ def write_glb(motion: Motion, path: str | Path, mesh: BodyMesh | None = None) ->
         Name of the file.
     mesh : BodyMesh, optional
         Body in the rest pose of ``motion``, relative to its only root, with joints of ``motion``
-        that move each vertex and perhaps colours; capsules by default.
+        that move each vertex and perhaps a texture; capsules by default.
 
     Raises
     ------
@@ -97,16 +99,7 @@ def write_glb(motion: Motion, path: str | Path, mesh: BodyMesh | None = None) ->
         "scenes": [{"nodes": [top, top + 1]}],
         "nodes": nodes,
         "meshes": [{"name": "body", "primitives": [primitive]}],
-        "materials": [
-            {
-                "name": "body",
-                "pbrMetallicRoughness": {
-                    "baseColorFactor": _COLOUR if mesh.colours is None else _WHITE,
-                    "metallicFactor": 0.0,
-                    "roughnessFactor": 0.7,
-                },
-            }
-        ],
+        **_materials(buffer, mesh.texture),
         "skins": [{"inverseBindMatrices": binds, "skeleton": top, "joints": list(range(top))}],
         "animations": [animation],
         "accessors": buffer.accessors,
@@ -133,16 +126,24 @@ class _Buffer:
         self.views: list[dict[str, int]] = []
         self.accessors: list[dict[str, Any]] = []
 
+    def add_bytes(self, content: bytes) -> int:
+        """Append bytes and return the index of their view."""
+        self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": len(content)})
+        self.data += content
+        self.data += bytes(-len(self.data) % 4)
+        return len(self.views) - 1
+
     def add(
         self, values: np.ndarray, kind: int, target: int | None = None, bounds: bool = False
     ) -> int:
         """Append an array (n, components) and return the index of its accessor."""
         dtype = {_FLOAT: "<f4", _SHORT: "<u2", _INT: "<u4"}[kind]
         array = np.ascontiguousarray(values, dtype=dtype)
-        view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": array.nbytes}
-        self.views.append(view if target is None else {**view, "target": target})
+        view = self.add_bytes(array.tobytes())
+        if target is not None:
+            self.views[view]["target"] = target
         accessor = {
-            "bufferView": len(self.views) - 1,
+            "bufferView": view,
             "componentType": kind,
             "count": len(array),
             "type": _COMPONENTS[array.shape[1]],
@@ -150,8 +151,6 @@ class _Buffer:
         if bounds:
             accessor |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
         self.accessors.append(accessor)
-        self.data += array.tobytes()
-        self.data += bytes(-len(self.data) % 4)
         return len(self.accessors) - 1
 
 
@@ -170,8 +169,7 @@ def _check_mesh(mesh: BodyMesh, motion: Motion) -> None:
             f"motion must have one root if a mesh is given, got {len(motion.skeleton.roots)}"
         )
     n = len(mesh.vertices)
-    shapes = {"vertices": 3, "normals": 3, "joints": 4, "weights": 4}
-    for name, width in (shapes if mesh.colours is None else {**shapes, "colours": 3}).items():
+    for name, width in (("vertices", 3), ("normals", 3), ("joints", 4), ("weights", 4)):
         check_shape(name, getattr(mesh, name), (n, width))
         check_finite(name, getattr(mesh, name))
     check_shape("triangles", mesh.triangles, ("T", 3))
@@ -179,10 +177,17 @@ def _check_mesh(mesh: BodyMesh, motion: Motion) -> None:
         low, high = getattr(mesh, name).min(), getattr(mesh, name).max()
         if low < 0 or high >= limit:
             raise ValueError(f"{name} must be between 0 and {limit - 1}, got {low} to {high}")
-    if mesh.colours is not None and not ((mesh.colours >= 0) & (mesh.colours <= 1)).all():
+    if mesh.texture is None:
+        return
+    image, coordinates = mesh.texture
+    check_shape("image", image, ("H", "W", 3))
+    if image.dtype != np.uint8:
+        raise ValueError(f"image must be of uint8, got {image.dtype}")
+    check_shape("coordinates", coordinates, (n, 2))
+    if not ((coordinates >= 0) & (coordinates <= 1)).all():
         raise ValueError(
-            f"colours must be between 0 and 1, got {mesh.colours.min():.4g} to "
-            f"{mesh.colours.max():.4g}"
+            f"coordinates must be between 0 and 1, got {coordinates.min():.4g} to "
+            f"{coordinates.max():.4g}"
         )
 
 
@@ -195,10 +200,31 @@ def _primitive(buffer: _Buffer, mesh: BodyMesh) -> dict[str, Any]:
         "JOINTS_0": buffer.add(mesh.joints, _SHORT, _VERTICES),
         "WEIGHTS_0": buffer.add(weights, _FLOAT, _VERTICES),
     }
-    if mesh.colours is not None:
-        attributes["COLOR_0"] = buffer.add(mesh.colours, _FLOAT, _VERTICES)
+    if mesh.texture is not None:
+        attributes["TEXCOORD_0"] = buffer.add(mesh.texture.coordinates, _FLOAT, _VERTICES)
     indices = buffer.add(mesh.triangles.reshape(-1, 1), _INT, _INDICES)
     return {"attributes": attributes, "indices": indices, "material": 0}
+
+
+def _materials(buffer: _Buffer, texture: Texture | None) -> dict[str, Any]:
+    """Return the body's material and, with a texture, its image, which is stored as PNG."""
+    surface: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 0.7}
+    materials = [{"name": "body", "pbrMetallicRoughness": surface}]
+    if texture is None:
+        surface["baseColorFactor"] = _COLOUR
+        return {"materials": materials}
+    surface["baseColorTexture"] = {"index": 0}
+    encoded = io.BytesIO()
+    Image.fromarray(texture.image).save(encoded, "png")
+    view = buffer.add_bytes(encoded.getvalue())
+    # Smaller copies of the image, which viewers use by default, would mix its triangles.
+    filters = {"magFilter": _LINEAR, "minFilter": _LINEAR, "wrapS": _CLAMP, "wrapT": _CLAMP}
+    return {
+        "materials": materials,
+        "textures": [{"sampler": 0, "source": 0}],
+        "samplers": [filters],
+        "images": [{"name": "body", "bufferView": view, "mimeType": "image/png"}],
+    }
 
 
 def _animation(buffer: _Buffer, motion: Motion) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from probmotion import seeds
 from probmotion.extras import torch
 from probmotion.lifting.checks import Check
 from probmotion.models.images.category import Category
-from probmotion.models.images.encoder import EncoderNetwork, encoder_input
+from probmotion.models.images.encoder import EncoderNetwork, encoder_input, parameters_of
 from probmotion.models.images.encoder_training import TANGENTS, encoder_of
 from probmotion.models.images.observation import ImageObservation
 from probmotion.models.images.surface_prior import SurfacePrior
@@ -17,12 +17,17 @@ from probmotion.reconstruction.refinement import Mode, refine
 from probmotion.reconstruction.result import Reconstruction
 from probmotion.validation import check_count
 
-__all__ = ["encoded", "mixture_draws", "posterior_modes", "reconstruct"]
+__all__ = ["checked", "encoded", "mixture_draws", "posterior_modes", "reconstruct"]
 
 _STARTS, _KEPT = 6, 3  # draws from the encoder that are refined, and modes refined to the end
 _UNLIKELY = 0.02  # probability of a quarter turn below which its mean is not refined
-_UNCOVERED = 0.25
-"""Largest 1 − IoU of silhouette and mask of reconstructions that can be trusted."""
+_UNCOVERED, _UNUSUAL = 0.1, 2.0
+"""Largest values of reconstructions that can be trusted.
+
+They are of 1 − IoU relative to the outline (:func:`_uncovered`), and of the mean square of the
+standardised coefficients of the shape. Chosen on made images of validation clips, on discs,
+polygons and letters, and on masks of the other category.
+"""
 
 
 def reconstruct(
@@ -39,7 +44,7 @@ def reconstruct(
     Parameters
     ----------
     observation : ImageObservation
-        Masks, and colours if given.
+        Masks, and colours and features if given.
     category : Category
         Kind of body, with its encoder beside its file.
     draws : int
@@ -52,27 +57,53 @@ def reconstruct(
     FileNotFoundError
         If the category has no encoder.
     ValueError
-        If there are more images than frames of the category's motions.
+        If there are more images than frames of the category's motions, or features that the
+        category does not have.
     """
     check_count("draws", draws, 2)
+    category.check_features(observation.features)
     prior = SurfacePrior(category, observation.tangent, rotation=observation.rotation)
     modes = posterior_modes(encoder_of(category), prior, observation, seed)
     chosen = mixture_draws(modes, seeds.generator(seed, "draws"), draws)
-    result = Reconstruction(observation, prior, modes[0].theta, chosen, ())
+    return checked(Reconstruction(observation, prior, modes[0].theta, chosen, ()))
+
+
+def checked(result: Reconstruction) -> Reconstruction:
+    """Return a reconstruction with the checks of its field of view, silhouette and shape."""
+    category = result.prior.category
     return result.with_checks(
         Check(
             "field of view",
-            float(observation.tangent.max()),
+            float(result.observation.tangent.max()),
             TANGENTS[1],
             "the body fills more of the field of view than those that the encoder was trained on",
         ),
         Check(
             "silhouette",
-            1 - result.mask_iou,
+            _uncovered(result),
             _UNCOVERED,
             f"no body of the category {category.name} has this silhouette",
         ),
+        Check(
+            "shape",
+            float((result.theta[result.prior.layout.shape] ** 2).mean()),
+            _UNUSUAL,
+            f"the surface is unlike those of the category {category.name}",
+        ),
     )
+
+
+def _uncovered(result: Reconstruction) -> float:
+    """Return 1 − IoU of silhouette and mask for an outline as short as that of a square.
+
+    Silhouettes of thin bodies have a smaller IoU when outlines are equally far apart; 1 − IoU is
+    therefore divided by the ratio of the mask's outline to that of a square of its area.
+    """
+    mask = result.observation.mask
+    body = np.where(np.isfinite(mask), mask >= 0.5, np.nan)
+    outline = sum(np.nansum(np.abs(np.diff(body, axis=axis))) for axis in (1, 2))
+    square = 4 * np.sqrt(np.nansum(body) * len(body))  # of the mean area, in all T images
+    return float((1 - result.mask_iou) * square / max(outline, 1.0))
 
 
 def posterior_modes(
@@ -105,11 +136,11 @@ def encoded(
     noise = np.exp(spreads[drawn]) * rng.standard_normal((n, means.shape[-1]))
     values = np.concatenate([means[likely], means[drawn] + noise])
     quarters = np.concatenate([likely, drawn])
-    start = prior.layout.view.start
-    theta = np.zeros((len(values), prior.dim))
-    theta[:, :start] = values[:, 1 : start + 1]
-    theta[:, start + 2 : start + 7] = values[:, start + 1 :]
-    return prior.facing(theta, quarters * np.pi / 2 + values[:, 0])
+    first = parameters_of(
+        torch.as_tensor(values), torch.as_tensor(quarters), prior.layout.view.start
+    )
+    later = np.zeros((len(values), prior.dim - first.shape[1]))
+    return np.concatenate([first.numpy(), later], axis=1)
 
 
 def mixture_draws(modes: list[Mode], rng: np.random.Generator, n: int) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 
 from probmotion.files import forget_killed, locked_folder, writable_folder
 from probmotion.models.images.category import Category
-from probmotion.models.images.category_training import learn_surface
+from probmotion.models.images.category_training import feature_channels, learn_surface
 from probmotion.models.images.encoder import EncoderNetwork
 from probmotion.models.images.observation import ImageObservation
 from probmotion.models.images.surface_prior import SurfacePrior
@@ -40,7 +40,7 @@ def learn_category(
     """Learn a category in rounds; repeat the call to resume after the last finished round.
 
     Each round refines the encoder's hypotheses of each image to posterior modes, and then learns
-    surface and colours from the poses of the highest modes (:func:`learn_surface`).
+    surface, colours and features from the poses of the highest modes (:func:`learn_surface`).
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def learn_category(
     network : EncoderNetwork
         Its encoder; also starts later rounds.
     images : sequence of ImageObservation
-        Observations of one image each.
+        Observations of one image each, all of them with features or none.
     out : str or Path
         Folder for ``category.npz``, written after each round; created if missing.
     rounds : int
@@ -92,8 +92,13 @@ def learn_category(
 def check_rounds(
     category: Category, images: Sequence[ImageObservation], out: Path, rounds: int
 ) -> None:
-    """Raise ``ValueError`` if a folder has more rounds, or rounds of others than these."""
+    """Raise ``ValueError`` if a folder has more rounds, or rounds of others than these.
+
+    Also if only some images have features, or the category has others.
+    """
     check_count("rounds", rounds)
+    if feature_channels(images) and category.features.shape[1]:
+        category.check_features(images[0].features)
     done = rounds_done(out)
     if not done:
         return
@@ -127,7 +132,7 @@ def _record(category: Category, images: Sequence[ImageObservation]) -> dict[str,
     """Return checksums of what a run starts from, by the option's name."""
     content = hashlib.sha256()
     for image in images:
-        for array in (image.mask, image.rgb, image.tangent):
+        for array in (image.mask, image.rgb, image.features, image.tangent):
             content.update(b"" if array is None else np.asarray(array, dtype="<f4").tobytes())
     return {"category": category.digest, "clips": content.hexdigest()}
 
@@ -139,10 +144,15 @@ def _poses(
     label: str,
     progress: bool,
 ) -> np.ndarray:
-    """Return θ (N, dim) of the best mode of each image."""
+    """Return θ (N, dim) of the best mode of each image.
+
+    Features are not used before they are learnt.
+    """
     found = []
     with progress_bar(len(images), label, progress) as bar:
         for image in images:
+            if not category.features.shape[1]:
+                image = replace(image, features=None)
             prior = SurfacePrior(category, image.tangent)
             starts = encoded(network, prior, image, np.random.default_rng(0), 0)
             found.append(refine(prior, image, starts, keep=_KEPT)[0].theta)

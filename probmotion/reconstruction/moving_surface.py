@@ -45,7 +45,7 @@ def surface_frames(prior: SurfacePrior, theta: np.ndarray) -> np.ndarray:
 
 
 def skinned_mesh(prior: SurfacePrior, theta: np.ndarray) -> BodyMesh:
-    """Return the surface at θ (dim,) in the rest pose of :func:`rig_motion`, with its colours.
+    """Return the surface at θ (dim,) in the rest pose of :func:`rig_motion`.
 
     Vertices have moved along bones that are longer or shorter than those of the category.
     """
@@ -57,13 +57,16 @@ def skinned_mesh(prior: SurfacePrior, theta: np.ndarray) -> BodyMesh:
     vertices = category.skin.posed(p.rest_vertices, still, upright, origin, p.log_lengths)
     vertices = vertices[0, 0].numpy()
     joints = np.array(body.rig_joints)[surface.joints]
+    # Several bones may be of one joint of the rig, which must be named once.
+    same = joints[:, :, None] == joints[:, None]
+    first = same.argmax(axis=2) == np.arange(joints.shape[1])
+    weights = np.where(first, (same * surface.weights[:, None]).sum(axis=2), 0.0)
     return BodyMesh(
         vertices,
         vertex_normals(replace(surface, vertices=vertices)),
         surface.triangles,
-        np.where(surface.weights > 0, joints, 0),
-        surface.weights,
-        _linear(albedos(prior, theta[None])[0]),
+        np.where(weights > 0, joints, 0),
+        weights,
     )
 
 
@@ -71,11 +74,6 @@ def albedos(prior: SurfacePrior, theta: np.ndarray) -> np.ndarray:
     """Return the reflectance of red, green and blue, ``(n, dim) → (n, V, 3)``, 0 to 1."""
     values: np.ndarray = prior.parameters(torch.as_tensor(theta)).albedo.numpy()
     return np.clip(values, 0.0, 1.0)
-
-
-def _linear(stored: np.ndarray) -> np.ndarray:
-    """Return the linear intensities of stored (sRGB) ones; viewers of GLB files encode them."""
-    return np.where(stored <= 0.04045, stored / 12.92, ((stored + 0.055) / 1.055) ** 2.4)
 
 
 def _held(prior: SurfacePrior) -> list[int]:

@@ -74,7 +74,9 @@ def refine(
     modes: list[Mode] = []
     for number, (size, softness, steps) in enumerate(_STAGES):
         size = min(size, observed.size)
-        likelihood = ImageLikelihood.of(observed, size, torch.float32, softness)
+        likelihood = ImageLikelihood.of(
+            observed, size, torch.float32, prior.category.feature_noise, softness
+        )
         reached = [_ascend(prior, likelihood, point, steps) for point in points]
         reached.sort(key=lambda point: -point[1])
         if number == 0 and keep is not None:
@@ -88,9 +90,9 @@ def refine(
         turned = prior.facing(point.numpy(), math.atan2(float(pair[0]), float(pair[1])))
         value += 0.5 * float((pair**2).sum()) - 1.0
         point = torch.as_tensor(turned, dtype=torch.float32)
-        images = _images(prior, point[None], likelihood.size)
+        images = _images(prior, point[None], likelihood)
         _, information = likelihood.curvature(
-            images[0], _derivatives(prior, point, images[0], likelihood.size)
+            images[0], _derivatives(prior, point, images[0], likelihood)
         )
         precision = _BELIEVED * information.double().numpy() + np.eye(len(point))
         radial = np.zeros(len(point))
@@ -130,12 +132,11 @@ def _diverse(
 def _ascend(
     prior: SurfacePrior, likelihood: ImageLikelihood, theta: torch.Tensor, steps: int
 ) -> tuple[torch.Tensor, float]:
-    size = likelihood.size
-    images = _images(prior, theta[None], size)
+    images = _images(prior, theta[None], likelihood)
     value = float(_log_posterior(likelihood, theta[None], images)[0])
     damping = 1.0
     for _ in range(steps):
-        derivatives = _derivatives(prior, theta, images[0], size)
+        derivatives = _derivatives(prior, theta, images[0], likelihood)
         slope, information = likelihood.curvature(images[0], derivatives)
         slope = slope - theta
         information = information + torch.eye(len(theta))
@@ -145,7 +146,7 @@ def _ascend(
             step = torch.linalg.solve(damped, slope)
             tried.append(theta + step * min(1.0, _LONGEST / float(step.norm())))
         candidates = torch.stack(tried)
-        rendered = _images(prior, candidates, size)
+        rendered = _images(prior, candidates, likelihood)
         values = _log_posterior(likelihood, candidates, rendered)
         best = int(values.argmax())
         gain = float(values[best]) - value
@@ -167,14 +168,17 @@ def _log_posterior(
     return likelihood.log_density(images) - 0.5 * (theta**2).sum(dim=1)
 
 
-def _images(prior: SurfacePrior, theta: torch.Tensor, size: int) -> torch.Tensor:
+def _images(prior: SurfacePrior, theta: torch.Tensor, likelihood: ImageLikelihood) -> torch.Tensor:
+    """Return the images that the likelihood compares, (n, T, S, S, C)."""
+    features = likelihood.features.shape[-1] > 0
     with torch.no_grad():
-        return torch.cat([prior.render(rows, size) for rows in theta.split(_ROWS)])
+        parts = [prior.render(rows, likelihood.size, features) for rows in theta.split(_ROWS)]
+    return torch.cat(parts)
 
 
 def _derivatives(
-    prior: SurfacePrior, theta: torch.Tensor, images: torch.Tensor, size: int
+    prior: SurfacePrior, theta: torch.Tensor, images: torch.Tensor, likelihood: ImageLikelihood
 ) -> torch.Tensor:
-    """Return the derivatives of the images in all coordinates, (dim, T, S, S, 4)."""
+    """Return the derivatives of the images in all coordinates, (dim, T, S, S, C)."""
     moved = theta + _DIFFERENCE * torch.eye(len(theta))
-    return (_images(prior, moved, size) - images) / _DIFFERENCE
+    return (_images(prior, moved, likelihood) - images) / _DIFFERENCE

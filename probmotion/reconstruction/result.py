@@ -19,6 +19,7 @@ from probmotion.models.images.surface_prior import SurfacePrior
 from probmotion.motion.motion import Motion
 from probmotion.reconstruction.moving_surface import rig_motion, skinned_mesh
 from probmotion.reconstruction.page import reconstruction_page
+from probmotion.reconstruction.texture import textured
 from probmotion.validation import check_count, check_finite, check_shape
 
 __all__ = ["Reconstruction"]
@@ -168,7 +169,7 @@ class Reconstruction:
     def save(self, folder: str | Path) -> None:
         """Write the page, the surface as GLB, all draws, and a summary.
 
-        The files are ``reconstruct.html``, ``body.glb`` (body of the mode, with its colours,
+        The files are ``reconstruct.html``, ``body.glb`` (body of the mode, with a texture,
         moved by the draw whose joints are closest to those of the mode), ``reconstruction.npz``
         (this motion, θ of the mode and the draws, and the draws' joints), and ``summary.json``.
         """
@@ -177,7 +178,8 @@ class Reconstruction:
         self.report(folder / "reconstruct.html")
         theta = self._moving()
         motion = replace(rig_motion(self.prior, theta), name=self.prior.category.name)
-        write_glb(motion, folder / "body.glb", skinned_mesh(self.prior, theta))
+        mesh = textured(skinned_mesh(self.prior, theta), self.observation, self.prior, self.theta)
+        write_glb(motion, folder / "body.glb", mesh)
         arrays = {"theta": self.theta, "draws": self.draws, "joints": self.joints}
         write_npz(motion, folder / "reconstruction.npz", arrays)
         content = {

@@ -47,8 +47,8 @@ def command(start, out, *more):
     return [*args.split(), *map(str, more)]
 
 
-def write_clip(folder: Path, names=("a", "b")) -> Path:
-    """Write images of a grey rectangle and its masks."""
+def write_clip(folder: Path, names=("a", "b"), channels=0) -> Path:
+    """Write images of a grey rectangle, its masks, and features if they have channels."""
     mask = np.zeros((40, 60), dtype=np.uint8)
     mask[10:30, 15:45] = 255
     for part in ("images", "masks"):
@@ -57,6 +57,11 @@ def write_clip(folder: Path, names=("a", "b")) -> Path:
             Image.fromarray(mask // 2 if part == "images" else mask).save(
                 folder / part / f"{name}.png"
             )
+    if channels:
+        (folder / "features").mkdir()
+        grid = np.random.default_rng(0).standard_normal((4, 6, channels))
+        for name in names:
+            np.savez(folder / "features" / f"{name}.npz", grid)
     return folder
 
 
@@ -111,6 +116,33 @@ def test_clips_are_read_from_folders(start, tmp_path, capsys):
     clips = [write_clip(tmp_path / "one", ("a", "b", "c")), write_clip(tmp_path / "two")]
     assert main(command(start, out, "--rounds", 1, "--images", 4, "--clips", *clips)) == 0
     assert f"{out / 'category.npz'}: 1 rounds of 4 images" in capsys.readouterr().out
+
+
+def test_features_are_learnt_from_folders(start, tmp_path, fails):
+    out = tmp_path / "run"
+    clip, other = write_clip(tmp_path / "clip", channels=2), write_clip(tmp_path / "other")
+    for clips, words in (
+        ([clip, other], "images must all have the same number of features, or all have none, got"),
+        ([write_clip(tmp_path / "odd", ("a", "b", "c"), 2)], "images and features of a clip must"),
+        ([write_clip(tmp_path / "none", channels=2)], "clips must contain .npz, got none in"),
+    ):
+        for path in ("odd/features/b.npz", "none/features/a.npz", "none/features/b.npz"):
+            (tmp_path / path).unlink(missing_ok=True)
+        assert fails(*command(start, out, "--clips", *clips)).startswith(words)
+        assert not out.exists()
+    assert main(command(start, out, "--images", 2, "--clips", clip)) == 0
+    learnt = Category.load(out / "category.npz")
+    assert learnt.card["rounds"] == 2
+    assert learnt.features.shape[1] == len(learnt.feature_noise) == 2
+    assert encoder_of(learnt).dim > 0
+    # Checksums of clips include features.
+    grid = np.ones((4, 6, 2))
+    np.savez(clip / "features" / "a.npz", grid)
+    again = command(start, out, "--images", 2, "--clips", clip)
+    assert fails(*again).startswith(f"clips must be the same to resume {out}")
+    more = write_clip(tmp_path / "more", channels=3)
+    message = fails(*command(out / "category.npz", tmp_path / "next", "--clips", more))
+    assert message.startswith("category animal must have image features of 3 channels, got 2;")
 
 
 def test_wrong_folders_give_one_error_line_and_no_files(start, tmp_path, fails):

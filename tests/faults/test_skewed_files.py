@@ -97,7 +97,7 @@ KINDS = {
     "decomposition": (OWN["decomposition"][0], lambda f: OWN["decomposition"][1](f)._values),
     **{
         name: OWN[name]
-        for name in ("annotations", "annotation prior", "pose depth", "joint limits")
+        for name in ("annotations", "annotation prior", "pose depth", "joint limits", "category")
     },
     "stored problem": OWN["stored problem"],
 }

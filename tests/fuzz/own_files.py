@@ -1,6 +1,7 @@
 """Small valid files of every kind that this package writes for itself, with their readers."""
 
 import json
+from functools import partial
 
 import numpy as np
 from made_reports import WALK, filmed_problem, walk_prior
@@ -102,6 +103,44 @@ def write_depths(folder):
     PoseDepth(layers, {"command": "x"}).save(folder / "d.npz")
 
 
+def write_category(folder):
+
+    from tests.models.images.bodies import small_quadruped
+
+    small_quadruped().save(folder / "c.npz")
+
+
+def read_category(folder):
+    """Load a category and render a body of it."""
+    import torch
+
+    from probmotion.models.images.category import Category
+    from probmotion.models.images.surface_prior import SurfacePrior
+
+    prior = SurfacePrior(Category.load(folder / "c.npz"), np.array([0.15]))
+    return prior.render(torch.zeros(1, prior.dim), 8)
+
+
+def write_images(folder):
+    from PIL import Image
+
+    body = np.zeros((24, 20), np.uint8)
+    body[6:18, 4:15] = 255
+    colours = np.random.default_rng(0).integers(255, size=(24, 20, 3), dtype=np.uint8)
+    for ending in ("png", "jpg"):
+        Image.fromarray(colours).save(folder / f"image.{ending}")
+    Image.fromarray(body).save(folder / "mask.png")
+    np.savez(folder / "features.npz", features=colours[:6, :5].astype(np.float32))
+
+
+def read_images(folder):
+    from probmotion.models.images.observation import ImageObservation
+
+    read = partial(ImageObservation.read, mask=folder / "mask.png", size=16)
+    read(folder / "image.jpg")
+    return read(folder / "image.png", features=folder / "features.npz")
+
+
 def write_checkpoint(folder):
     import torch
 
@@ -178,6 +217,8 @@ OWN = {
         lambda folder: JointLimits.shipped().save(folder / "l.npz"),
         lambda folder: JointLimits.load(folder / "l.npz"),
     ),
+    "category": (write_category, read_category),
+    "images": (write_images, read_images),
     "checkpoint": (write_checkpoint, read_checkpoint),
     "summary": (write_checkpoint, read_summary),
     "chain": (write_chain, lambda folder: StoredChain(folder / "chain.npz").load()),

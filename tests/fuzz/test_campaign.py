@@ -109,6 +109,7 @@ def motion_kinds():
 LEG = Skeleton(["hip", "knee"], [-1, 0])
 # Readers that take more than a millisecond get fewer inputs.
 SHARES = {"report": 0.01, "comparison": 0.1, "draws": 0.4, "joint limits": 0.4, "summary": 0.3}
+SHARES |= {"category": 0.1, "images": 0.4}
 SHARES |= {"stored problem": 0.5, "checkpoint": 0.5}
 WORDS = {
     "problem": (b"gait-monocular(frames=20, noise=0.05)", read_names, 1.0),

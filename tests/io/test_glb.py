@@ -1,5 +1,6 @@
 """GLB files, read back by the specification without the writer's code."""
 
+import io
 import json
 import shutil
 import struct
@@ -7,16 +8,17 @@ import subprocess
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from probmotion import Motion, Skeleton, load, save
 from probmotion.data.synthetic.gaits import make_gait
-from probmotion.io.body_mesh import BodyMesh, body_mesh
+from probmotion.io.body_mesh import BodyMesh, Texture, body_mesh
 from probmotion.io.glb import write_glb
 from probmotion.motion.inverse_kinematics import rigid_motion
 from probmotion.motion.rest_poses import joint_positions
 
 DTYPES = {5126: "<f4", 5123: "<u2", 5125: "<u4"}
-WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 VALIDATE = """
 const validator = require('gltf-validator'), fs = require('fs');
 validator.validateBytes(new Uint8Array(fs.readFileSync(process.argv[1])))
@@ -90,6 +92,13 @@ class Scene:
             np.testing.assert_array_equal(values.max(axis=0), np.float32(accessor["max"]))
         return values
 
+    def image(self, index):
+        image = self.json["images"][index]
+        assert image["mimeType"] == "image/png"
+        view = self.json["bufferViews"][image["bufferView"]]
+        end = view["byteOffset"] + view["byteLength"]
+        return np.array(Image.open(io.BytesIO(self.data[view["byteOffset"] : end])))
+
     def mesh(self):
         (primitive,) = self.json["meshes"][0]["primitives"]
         arrays = {name: self.array(at) for name, at in primitive["attributes"].items()}
@@ -150,27 +159,29 @@ def test_skinned_joints_follow_the_rigid_motion(tmp_path, kind):
     np.testing.assert_allclose(moved[..., :3], rigid.positions, atol=1e-5)
 
 
-def coloured_walk():
-    """A rigid motion and a mesh relative to its root: the capsules above the pelvis, in colours."""
+def textured_walk():
+    """A rigid motion and a mesh relative to its root: textured capsules above the pelvis."""
     motion = rigid_motion(walk())
     rest = joint_positions(motion.skeleton, motion.rest_offsets)
     mesh = body_mesh(motion.skeleton, rest)
     n = len(mesh.vertices) // 2
     mesh = BodyMesh(*(array[:n] for array in mesh[:2]), mesh.triangles, *(a[:n] for a in mesh[3:5]))
     mesh = mesh._replace(triangles=mesh.triangles[(mesh.triangles < n).all(axis=1)])
-    return motion, mesh._replace(colours=np.random.default_rng(0).uniform(size=(n, 3)))
+    rng = np.random.default_rng(0)
+    image = rng.integers(256, size=(16, 8, 3), dtype=np.uint8)
+    return motion, mesh._replace(texture=Texture(image, rng.uniform(size=(n, 2))))
 
 
 def write(kind, path):
-    if kind == "coloured":
-        motion, mesh = coloured_walk()
+    if kind == "textured":
+        motion, mesh = textured_walk()
         write_glb(motion, path, mesh)
     else:
         save(MOTIONS[kind](), path)
 
 
-def test_given_meshes_are_written_with_their_colours(tmp_path):
-    motion, mesh = coloured_walk()
+def test_given_meshes_are_written_with_their_texture(tmp_path):
+    motion, mesh = textured_walk()
     write_glb(motion, tmp_path / "clip.glb", mesh)
     scene = Scene(tmp_path / "clip.glb")
     arrays, triangles = scene.mesh()
@@ -179,11 +190,16 @@ def test_given_meshes_are_written_with_their_colours(tmp_path):
         ("NORMAL", mesh.normals),
         ("JOINTS_0", mesh.joints),
         ("WEIGHTS_0", mesh.weights),
-        ("COLOR_0", mesh.colours),
+        ("TEXCOORD_0", mesh.texture.coordinates),
     ):
         np.testing.assert_allclose(arrays[name], values, atol=1e-6)
     (material,) = scene.json["materials"]
-    assert material["pbrMetallicRoughness"]["baseColorFactor"] == [1, 1, 1, 1]
+    surface = material["pbrMetallicRoughness"]
+    assert surface.get("baseColorFactor", [1, 1, 1, 1]) == [1, 1, 1, 1]
+    texture = scene.json["textures"][surface["baseColorTexture"]["index"]]
+    np.testing.assert_array_equal(scene.image(texture["source"]), mesh.texture.image)
+    # Without smaller copies of the image, since neighbours in it are not neighbours on the body.
+    assert scene.json["samplers"][texture["sampler"]]["minFilter"] in (9728, 9729)
     # The mesh keeps its place relative to the root, below which it stands on the floor.
     binds = scene.array(scene.json["skins"][0]["inverseBindMatrices"]).reshape(-1, 4, 4)
     root = -binds[motion.skeleton.roots[0], 3, :3]
@@ -197,26 +213,32 @@ def test_given_meshes_are_written_with_their_colours(tmp_path):
 def test_capsules_have_the_default_colour(tmp_path):
     save(walk(), tmp_path / "clip.glb")
     scene = Scene(tmp_path / "clip.glb")
-    assert "COLOR_0" not in scene.mesh()[0]
+    assert "TEXCOORD_0" not in scene.mesh()[0]
+    assert "images" not in scene.json
     assert scene.json["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"][0] < 1
 
 
 def test_meshes_that_do_not_fit_are_errors(tmp_path):
-    motion, mesh = coloured_walk()
-    high = mesh.joints + motion.skeleton.n_joints
+    def with_texture(image, coordinates):
+        return mesh._replace(texture=Texture(image, coordinates))
+
+    motion, mesh = textured_walk()
+    high, (image, coordinates) = mesh.joints + motion.skeleton.n_joints, mesh.texture
     for one, other, message in (
         (noisy_walk(), mesh, "motion must have rotations"),
         (rigid_motion(ball_and_person()), mesh, "motion must have one root .* got 2"),
         (motion, mesh._replace(joints=high), "joints must be between 0 and"),
-        (motion, mesh._replace(colours=2 + mesh.colours), "colours must be between 0 and 1"),
-        (motion, mesh._replace(colours=mesh.colours[:5]), "colours must have shape"),
+        (motion, with_texture(image, 2 + coordinates), "coordinates must be between 0 and 1"),
+        (motion, with_texture(image, coordinates[:5]), "coordinates must have shape"),
+        (motion, with_texture(image / 255, coordinates), "image must be of uint8, got float64"),
+        (motion, with_texture(image[..., 0], coordinates), "image must have shape"),
     ):
         with pytest.raises(ValueError, match=message):
             write_glb(one, tmp_path / "clip.glb", other)
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("kind", [*MOTIONS, "coloured"])
+@pytest.mark.parametrize("kind", [*MOTIONS, "textured"])
 def test_files_satisfy_the_specification(tmp_path, kind):
     write(kind, tmp_path / "clip.glb")
     scene = Scene(tmp_path / "clip.glb")
@@ -270,7 +292,7 @@ def test_the_body_moves_with_its_bones(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [*MOTIONS, "coloured"])
+@pytest.mark.parametrize("kind", [*MOTIONS, "textured"])
 def test_khronos_validator_finds_no_issue(tmp_path, kind):
     node = shutil.which("node")
     found = node and subprocess.run(

@@ -30,8 +30,11 @@ def asked(monkeypatch, make_result):
 
 @pytest.fixture
 def files(category, tmp_path):
-    """Folder with a category, two images, their masks and features."""
+    """Folder with a category without and one with features, two images, masks and features."""
+    from probmotion.models.images.made_images import with_made_features
+
     category.save(tmp_path / "dog.npz")
+    with_made_features(category, 3).save(tmp_path / "wolf.npz")
     inside = np.zeros((40, 60), dtype=np.uint8)
     inside[10:30, 15:45] = 255
     for number in range(2):
@@ -54,7 +57,8 @@ def run(files, capsys, *words, category="dog.npz"):
 
 def test_an_image_is_reconstructed(asked, files, capsys):
     words = ["image0.png", "--mask", "mask0.png", "--features", "features0.npz", "--fov", "60"]
-    status, text = run(files, capsys, *words, "--draws", "7", "--seed", "3")
+    more = ["--draws", "7", "--seed", "3"]
+    status, text = run(files, capsys, *words, *more, category="wolf.npz")
     assert status == 0, text
     ((observation, category, draws, seed),) = asked
     assert (observation.images, draws, seed, category.name) == (1, 7, 3, "quadruped")
@@ -93,6 +97,38 @@ def test_unknown_categories_are_refused(asked, files, capsys):
     words = ["image0.png", "--mask", "mask0.png"]
     failure = run(files, capsys, *words, category="cat")
     check_failure(files, "category must be a file or", *failure)
+
+
+def test_features_that_the_category_does_not_have_are_refused(asked, files, capsys):
+    words = ["image0.png", "--mask", "mask0.png", "--features", "features0.npz"]
+    message = "category quadruped must have image features of 3 channels, got none; leave"
+    check_failure(files, message, *run(files, capsys, *words))
+    assert asked == []
+
+
+def test_features_change_the_reconstruction(files, capsys, monkeypatch):
+    """With a network that was not trained, and one step of refinement."""
+    pytest.importorskip("numba", reason="numba is not installed")
+    from probmotion.models.images import encoder_training
+    from probmotion.models.images.category import Category
+    from probmotion.models.training.checkpoints import Checkpoint, save_checkpoint
+    from probmotion.reconstruction import refinement
+
+    monkeypatch.setattr(encoder_training, "_VALIDATED", 1)
+    monkeypatch.setattr(refinement, "_STAGES", ((32, 1.0, 1),))
+    trainee = encoder_training.EncoderTrainee(Category.load(files / "wolf.npz"))
+    settings = {"network": dict(trainee.settings)}
+    checkpoint = Checkpoint(trainee.kind, settings, trainee.network.state_dict())
+    save_checkpoint(files / "wolf.safetensors", checkpoint)
+    rng = np.random.default_rng(0)
+    np.savez(files / "features1.npz", rng.standard_normal((4, 6, 3)))
+    found = []
+    for more in ([], ["--features", "features0.npz"], ["--features", "features1.npz"]):
+        words = ["image0.png", "--mask", "mask0.png", "--draws", "2", *more]
+        status, text = run(files, capsys, *words, category="wolf.npz")
+        assert status == 0, text
+        found.append(np.load(files / "out" / "reconstruction.npz")["theta"])
+    assert all((found[k] != found[k - 1]).any() for k in range(3))
 
 
 def check_failure(files, message, status, text):

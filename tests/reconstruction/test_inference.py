@@ -14,8 +14,8 @@ from probmotion.models.images.encoder import Estimates
 from probmotion.models.images.made_images import make_images
 from probmotion.models.images.observation import ImageObservation
 from probmotion.models.images.surface_prior import SurfacePrior
-from probmotion.reconstruction import reconstruct
-from probmotion.reconstruction.inference import encoded
+from probmotion.reconstruction import Reconstruction, reconstruct
+from probmotion.reconstruction.inference import _uncovered, encoded
 from probmotion.reconstruction.refinement import Mode, refine
 
 SIZE, TANGENT = 64, np.array([0.15])
@@ -98,16 +98,47 @@ def test_reconstruction_covers_the_mask_and_is_near_the_truth(animal) -> None:
     assert error < 0.5 * turned
 
 
-def test_a_silhouette_of_something_else_is_not_trusted(animal) -> None:
-    """A ring is no animal."""
+@pytest.mark.parametrize(
+    "power", [pytest.param(2, marks=pytest.mark.slow, id="disc"), pytest.param(100, id="square")]
+)
+def test_a_silhouette_of_something_else_is_not_trusted(animal, power) -> None:
+    """Thick bodies cover a disc and a square, but neither closely nor with usual shapes."""
     category, _, _ = animal
-    place = 2 * (np.arange(SIZE) + 0.5) / SIZE - 1
-    radius = np.hypot(place, place[:, None])
-    mask = ((radius > 0.5) & (radius < 0.8)).astype(float)
-    ring = ImageObservation(mask[None], None, None, TANGENT, np.eye(3)[None])
-    result = reconstruct(ring, category, draws=2)
-    assert not result.trusted
-    assert "silhouette" in result.summary()[0]
+    place = np.abs(2 * (np.arange(SIZE) + 0.5) / SIZE - 1)
+    mask = (place**power + place[:, None] ** power < 0.8**power).astype(float)
+    other = ImageObservation(mask[None], None, None, TANGENT, np.eye(3)[None])
+    result = reconstruct(other, category, draws=2)
+    failed = {check.name for check in result.checks if not check.passed}
+    assert failed == {"silhouette", "shape"}
+    assert "no body" in result.summary()[0]
+    assert "surface" in result.summary()[0]
+
+
+@pytest.mark.parametrize(
+    ("starts", "width", "rows", "area", "outline"),
+    [
+        ([8], 48, SIZE, 48 * 48, 4 * 48),
+        ([8], 48, 32, 48 * 24, 48 + 2 * 24),
+        ([8, 24, 40], 8, SIZE, 3 * 48 * 8, 3 * 2 * (48 + 8)),
+    ],
+    ids=["square", "half unknown", "bars"],
+)
+def test_errors_of_silhouettes_are_relative_to_the_outline(
+    animal, starts, width, rows, area, outline
+) -> None:
+    """The factor of 1 − IoU is 1 for a square, also of two equal images, and less for bars."""
+    category, single, made = animal
+    mask = np.zeros((2, SIZE, SIZE))
+    for start in starts:
+        mask[:, 8:56, start : start + width] = 1
+    mask[:, rows:] = np.nan
+    rotation = np.tile(np.eye(3), (2, 1, 1))
+    observation = ImageObservation(mask, None, None, np.repeat(TANGENT, 2), rotation)
+    prior = SurfacePrior(category, observation.tangent)
+    theta = np.concatenate([made.theta[0], np.zeros(prior.dim - single.dim)])
+    result = Reconstruction(observation, prior, theta, np.stack([theta, theta]), ())
+    expected = (1 - result.mask_iou) * 4 * np.sqrt(area) / outline
+    assert _uncovered(result) == pytest.approx(expected)
 
 
 @pytest.mark.slow

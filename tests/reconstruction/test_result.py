@@ -23,7 +23,7 @@ FLIP = np.array([1.0, -1.0, -1.0])  # from the axes of the camera to those of mo
 
 
 def shown_vertices(path):
-    """Return the vertices of a GLB file in all frames as viewers show them, and their colours."""
+    """Return the vertices of a GLB file in all frames as viewers show them, (L, N, 3)."""
     content = path.read_bytes()
     (size,) = struct.unpack("<I", content[12:16])
     scene, data = json.loads(content[20 : 20 + size]), content[28 + size :]
@@ -63,8 +63,7 @@ def shown_vertices(path):
     joints = array(attributes["JOINTS_0"]).astype(int)
     blended = np.einsum("vk,vklij->lvij", array(attributes["WEIGHTS_0"]), moves[joints])
     points = array(attributes["POSITION"])
-    moved = np.einsum("lvij,vj->lvi", blended[..., :3, :3], points) + blended[..., :3, 3]
-    return moved, array(attributes["COLOR_0"])
+    return np.einsum("lvij,vj->lvi", blended[..., :3, :3], points) + blended[..., :3, 3]
 
 
 def test_the_file_shows_the_surface_of_the_prior(category, tmp_path):
@@ -72,13 +71,15 @@ def test_the_file_shows_the_surface_of_the_prior(category, tmp_path):
     prior = SurfacePrior(category, np.full(category.code.frames, 0.15))
     theta = rng.normal(size=prior.dim)
     motion = rig_motion(prior, theta)
-    write_glb(motion, tmp_path / "body.glb", skinned_mesh(prior, theta))
-    shown, colours = shown_vertices(tmp_path / "body.glb")
+    mesh = skinned_mesh(prior, theta)
+    write_glb(motion, tmp_path / "body.glb", mesh)
+    shown = shown_vertices(tmp_path / "body.glb")
     vertices = prior.vertices(torch.as_tensor(theta[None]))[0].numpy() * FLIP
     errors = np.linalg.norm(shown - vertices, axis=-1)
     assert errors.max() < 1e-5
     assert np.ptp(vertices, axis=0).max() > 0.03  # it moves
-    assert colours.min() >= 0
+    for joints, weights in zip(mesh.joints, mesh.weights, strict=True):
+        assert len({*joints[weights > 0]}) == (weights > 0).sum()
     np.testing.assert_allclose(surface_frames(prior, theta[None])[0], vertices, atol=1e-12)
     joints = motion.positions[:, : prior.skeleton.n_joints]
     np.testing.assert_allclose(joints, prior.motion(theta), atol=1e-9)
@@ -156,8 +157,10 @@ def test_all_files_are_saved(result, tmp_path):
     joints = motion.positions[:, : result.joints.shape[1]]
     # The mode moves as a draw that faces the same side.
     assert np.abs(joints[0] - result.joints).mean(axis=(1, 2)).argmin() >= 3
-    shown, _ = shown_vertices(tmp_path / "body.glb")
+    shown = shown_vertices(tmp_path / "body.glb")
     assert np.linalg.norm(shown.mean(axis=1) - joints.mean(axis=1), axis=-1).max() < 0.2
+    corners = result.prior.category.surface.triangles.size
+    assert shown.shape[1] == corners  # triangles have vertices of their own, for the texture
 
 
 @pytest.mark.parametrize(

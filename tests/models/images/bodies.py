@@ -30,7 +30,7 @@ def small_quadruped() -> Category:
     turns = ends[0] * (1 - path) + ends[1] * path
     shapes = 0.02 * rng.normal(size=(3, 1, 3)) * surface.vertices[:, [1]]
     albedo = np.tile([0.6, 0.4, 0.2], (len(surface.vertices), 1))
-    features = np.zeros((len(albedo), 0))
+    features = np.zeros((len(albedo), 0)), np.zeros(0)
     code = TurnCode(turns[0] / 2, turns, 10.0)
     light = 0.05 * np.ones((1, *albedo.shape))
-    return Category("quadruped", body, surface, shapes, albedo, light, code, 0.06, features)
+    return Category("quadruped", body, surface, shapes, albedo, light, code, 0.06, *features)

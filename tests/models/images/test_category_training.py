@@ -1,4 +1,4 @@
-"""Learning of a surface: errors of made categories, symmetry, determinism and bad input."""
+"""Learning of surface, colours and features: errors of made categories, symmetry, bad input."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from probmotion.extras import torch
 from probmotion.models.images import category as module
 from probmotion.models.images.category import Category, folded
 from probmotion.models.images.category_training import _Shared, learn_surface
-from probmotion.models.images.made_images import make_category, make_clips
+from probmotion.models.images.made_images import make_category, make_clips, with_made_features
 from probmotion.models.images.surface import rest_surface
 from probmotion.models.images.surface_prior import SurfacePrior
 from probmotion.models.latent.turn_code import TurnCode
@@ -23,13 +23,13 @@ from probmotion.models.vae.motion_vae import MotionVAE
 
 @pytest.fixture(scope="module")
 def case():
-    """A category, a made one, 20 images of that and their θ."""
+    """A category, a made one with features, 20 images of that and their θ."""
     body, rng = MotionVAE.load("animal-vae").body, np.random.default_rng(0)
     turns = 0.15 * rng.standard_normal((4, 1, len(body.bones), 3))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "rest_surface", lambda body: rest_surface(body, 250))
         category = Category.of_capsules("animal", body, TurnCode(0 * turns[0], turns, 10.0))
-    true = make_category(category, rng)
+    true = with_made_features(make_category(category, rng), 3)
     return category, true, *make_clips(true, rng, 20, 1, 32)
 
 
@@ -54,10 +54,46 @@ def test_errors_of_surface_and_albedo_fall(case, learnt):
 
 def test_only_the_means_change(case, learnt):
     category = case[0]
-    for name in ("body", "shapes", "albedos", "code", "length_spread", "features"):
+    for name in ("body", "shapes", "albedos", "code", "length_spread"):
         assert getattr(learnt, name) is getattr(category, name)
     for name in ("triangles", "joints", "weights"):
         assert getattr(learnt.surface, name) is getattr(category.surface, name)
+
+
+def test_features_of_vertices_and_their_noise_are_found(case, learnt):
+    """Errors are less than a quarter of the features' spread, and those of the noise 20 %."""
+    _, true, _, _ = case
+    errors = np.sqrt(((learnt.features - true.features) ** 2).mean(axis=0))
+    assert (errors < 0.25 * true.features.std(axis=0)).all()
+    np.testing.assert_allclose(learnt.feature_noise, true.feature_noise, rtol=0.2)
+
+
+def test_unknown_features_do_not_count(case):
+    """What is NaN in half of each image is found nevertheless; a channel of zeros is no error."""
+    category, true, images, theta = case
+    size = images[0].size
+    changed = []
+    for k, image in enumerate(images):
+        features = image.features * np.array([1, 0, 1], dtype=np.float32)
+        features[:, :, np.arange(size) % 2 == k % 2] = np.nan
+        changed.append(replace(image, features=features))
+    found = learn_surface(category, changed, theta, steps=1)
+    pairs = zip(found.features.T, true.features.T, strict=True)
+    correlations = [np.corrcoef(*pair)[0, 1] for pair in pairs if pair[0].any()]
+    assert len(correlations) == 2
+    assert min(correlations) > 0.9
+    assert not found.features[:, 1].any()
+    hidden = [replace(image, features=image.features * np.nan) for image in changed]
+    with pytest.raises(ValueError, match="images must have features inside their masks"):
+        learn_surface(category, hidden, theta, steps=1)
+
+
+def test_features_remain_if_the_images_have_none(case):
+    _, true, images, theta = case
+    without = [replace(image, features=None) for image in images[:2]]
+    found = learn_surface(true, without, theta[:2], steps=1)
+    assert found.features is true.features
+    assert found.feature_noise is true.feature_noise
 
 
 def test_symmetric_surfaces_remain_symmetric(case, learnt):
@@ -66,6 +102,7 @@ def test_symmetric_surfaces_remain_symmetric(case, learnt):
     other = np.abs((before * flip)[:, None] - before).sum(axis=-1).argmin(axis=1)
     np.testing.assert_allclose(after[other], after * flip, atol=1e-6)
     np.testing.assert_allclose(learnt.albedo[other], learnt.albedo, atol=1e-6)
+    np.testing.assert_allclose(learnt.features[other], learnt.features, atol=1e-6)
     np.testing.assert_array_equal(folded(after)[:, 1:], after[:, 1:])
     assert folded(after)[:, 0].min() >= 0
     lopsided = after + 0.01 * np.eye(3)[0] * after[:, 1:2]
@@ -98,12 +135,17 @@ def test_bad_input(case):
         images[0],
         mask=np.repeat(images[0].mask, 2, axis=0),
         rgb=None,
+        features=None,
         tangent=np.repeat(images[0].tangent, 2),
         rotation=np.repeat(images[0].rotation, 2, axis=0),
     )
     for arguments, words in (
         (([], theta[:0]), "images must be observations of one image each, got no observations"),
         (([clip], theta[:1]), r"images must be observations of one image each, got \[2\]"),
+        (
+            ([images[0], replace(images[1], features=None)], theta[:2]),
+            "images must all have the same number of features, or all have none, got 0 and 3",
+        ),
         ((images[:2], theta[:3]), "theta must have shape"),
         ((images[:1], theta[:1] * np.nan), "theta must be finite"),
     ):

@@ -141,6 +141,37 @@ def test_images_are_reproducible_and_independent_of_their_batch(scene):
 
 
 @needs_llvm
+def test_channels_are_those_of_separate_images(scene):
+    vertices, triangles, colours = scene
+    channels = np.concatenate([colours, np.cos(3 * vertices[:, :2])], axis=1)
+    weights = torch.tensor(np.random.default_rng(1).normal(size=(SIZE, SIZE, 6)))
+
+    def drawn(columns):
+        parts = [tensor(each).requires_grad_() for each in (vertices, channels)]
+        image = MitsubaRenderer(4).render(
+            parts[0], triangles, parts[1][..., columns], TANGENT, SIZE
+        )
+        return image, parts
+
+    image, parts = drawn(range(5))
+    assert image.shape == (1, SIZE, SIZE, 6)
+    gradients = torch.autograd.grad(image, parts, weights[None])
+    expected = [torch.zeros_like(part) for part in parts]
+    for columns in ([0, 1, 2], [3], [4]):
+        alone, parts = drawn(columns)
+        assert torch.equal(alone[..., :-1], image[..., columns])
+        assert torch.equal(alone[..., -1], image[..., -1])
+        # Coverage counts once.
+        slopes = torch.cat([weights[..., columns], weights[..., 5:] * (columns[0] == 0)], dim=-1)
+        for total, part in zip(
+            expected, torch.autograd.grad(alone, parts, slopes[None]), strict=True
+        ):
+            total += part
+    for gradient, total in zip(gradients, expected, strict=True):
+        torch.testing.assert_close(gradient, total, rtol=1e-3, atol=1e-3)
+
+
+@needs_llvm
 @pytest.mark.parametrize(("depth", "covered"), [(-3.0, 0.0), (0.0, 1.0)], ids=["behind", "around"])
 def test_a_mesh_without_visible_silhouette_has_no_gradient(depth, covered):
     vertices, triangles = sphere([0, 0, depth], 0.5, 2)

@@ -22,7 +22,8 @@ def ball(radius: float = 0.5, centre: tuple[float, float, float] = CENTRE) -> to
 
 
 def colours_of(vertices: torch.Tensor) -> torch.Tensor:
-    return 0.5 + 0.4 * torch.sin(3 * vertices)
+    """Return three colours and two features of both signs, (B, V, 5)."""
+    return torch.cat([0.5 + 0.4 * torch.sin(3 * vertices), torch.cos(4 * vertices[..., :2])], -1)
 
 
 def draw(vertices: torch.Tensor, colours: torch.Tensor | None = None) -> torch.Tensor:
@@ -54,7 +55,7 @@ def test_images_change_continuously() -> None:
 
 RANDOM = torch.tensor(np.random.default_rng(3).standard_normal((1, 642, 3)))
 WEIGHT = torch.tensor(
-    gaussian_filter(np.random.default_rng(0).standard_normal((SIZE, SIZE, 4)), (5, 5, 0))
+    gaussian_filter(np.random.default_rng(0).standard_normal((SIZE, SIZE, 6)), (5, 5, 0))
 )
 MOVES = {
     "right": lambda x: torch.tensor([1.0, 0.0, 0.0]).expand_as(x),
@@ -91,7 +92,7 @@ def test_gradients_add_up_to_changes_over_a_pixel(move: str) -> None:
 
 def test_gradients_of_colours_are_exact() -> None:
     colours = colours_of(ball()).requires_grad_()
-    weight = torch.tensor(np.random.default_rng(1).standard_normal((SIZE, SIZE, 4)))
+    weight = torch.tensor(np.random.default_rng(1).standard_normal((SIZE, SIZE, 6)))
     (draw(ball(), colours) * weight).sum().backward()
     direction = torch.tensor(np.random.default_rng(2).standard_normal(colours.shape))
     with torch.no_grad():
@@ -99,6 +100,21 @@ def test_gradients_of_colours_are_exact() -> None:
         change = other - (draw(ball(), colours) * weight).sum()
     assert colours.grad is not None
     assert float((colours.grad * direction).sum()) == pytest.approx(float(change), rel=1e-6)
+
+
+def test_channels_do_not_depend_on_each_other() -> None:
+    """Images of several channels, and their gradients, are those of each channel alone."""
+    places, weight = ball().requires_grad_(), WEIGHT
+    together = draw(places, colours_of(ball()))
+    apart = [draw(places, channel) for channel in colours_of(ball()).split(1, dim=-1)]
+    for k, image in enumerate(apart):
+        torch.testing.assert_close(together[..., [k, 5]], image, rtol=0, atol=0)
+    pairs = [image[..., 0] * weight[..., k] for k, image in enumerate(apart)]
+    pairs.append(apart[0][..., 1] * weight[..., 5])
+    gradients = [
+        torch.autograd.grad(value.sum(), places)[0] for value in (together * weight, sum(pairs))
+    ]
+    torch.testing.assert_close(*gradients, rtol=1e-9, atol=1e-9)
 
 
 def test_the_nearer_of_two_bodies_is_seen() -> None:
@@ -122,6 +138,12 @@ def test_bodies_of_a_batch_are_independent() -> None:
 
 def test_a_body_behind_the_camera_is_not_seen() -> None:
     assert float(draw(ball(0.5, (0.0, 0.0, -4.0))).sum()) == 0.0
+
+
+@pytest.mark.parametrize("shape", [(1, 642, 0), (1, 641, 3), (642, 3)])
+def test_colours_are_those_of_the_vertices(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="colours"):
+        draw(ball(), torch.zeros(shape))
 
 
 def test_open_meshes_are_refused() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -227,3 +228,19 @@ def test_surfaces_do_not_depend_on_chance():
     first, again = surface_of("person")[1], rest_surface(BODIES["person"]())
     for name in ("vertices", "triangles", "joints", "weights"):
         np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("vertices", np.nan, "vertices must be finite"),
+        ("triangles", 700, "triangles must be of vertices 0 to"),
+        ("weights", -0.1, "weights must be at least 0 with sums 1"),
+    ],
+)
+def test_other_surfaces_are_refused(name, value, words) -> None:
+    surface = surface_of("lopsided")[1]
+    changed = getattr(surface, name).copy()
+    changed[3, 1] = value
+    with pytest.raises(ValueError, match=words):
+        replace(surface, **{name: changed})

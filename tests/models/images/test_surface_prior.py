@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from scipy.ndimage import maximum_filter
 from scipy.spatial.transform import Rotation
 
 from probmotion.models.images.image_likelihood import ImageLikelihood
-from probmotion.models.images.made_images import make_images
+from probmotion.models.images.made_images import make_images, with_made_features
 from probmotion.models.images.observation import ImageObservation
 from probmotion.models.images.posing import shaded
 from probmotion.models.images.surface_prior import SurfacePrior
@@ -32,9 +33,18 @@ def made(prior):
     return make_images(prior, np.random.default_rng(0), 6, SIZE)
 
 
+@pytest.fixture(scope="module")
+def cases(category, prior, made):
+    """Prior and made images without and with three features."""
+    other = SurfacePrior(with_made_features(category, 3), np.array([TANGENT]))
+    described = make_images(other, np.random.default_rng(0), 2, SIZE)
+    return {"colours": (prior, made), "features": (other, described)}
+
+
 def observed(made, k: int) -> ImageObservation:
+    features = None if made.features is None else made.features[k][None]
     return ImageObservation(
-        made.mask[k][None], made.rgb[k][None], None, np.array([TANGENT]), np.eye(3)[None]
+        made.mask[k][None], made.rgb[k][None], features, np.array([TANGENT]), np.eye(3)[None]
     )
 
 
@@ -100,7 +110,9 @@ def test_bodies_face_where_they_are_told(prior, yaw: float) -> None:
     assert math.atan2(ahead[0], ahead[2]) == pytest.approx(yaw, abs=0.3)
 
 
-def test_density_has_the_derivative_of_finite_differences(prior, made) -> None:
+@pytest.mark.parametrize("case", ["colours", "features"])
+def test_density_has_the_derivative_of_finite_differences(cases, case) -> None:
+    prior, made = cases[case]
     posterior = MotionPosterior(prior, observed(made, 0))
     theta = torch.as_tensor(made.theta[:1]).requires_grad_()
     value = posterior.log_density(theta)
@@ -126,18 +138,129 @@ def test_images_do_not_depend_on_the_batch(prior, made) -> None:
     assert np.argmax(together) == 0
 
 
-def test_curvature_has_the_gradient_of_the_density(prior, made) -> None:
+@pytest.mark.parametrize("case", ["colours", "features"])
+def test_curvature_has_the_gradient_of_the_density(cases, case) -> None:
+    prior, made = cases[case]
     theta = torch.as_tensor(made.theta[0]).requires_grad_()
-    likelihood = ImageLikelihood.of(observed(made, 1), SIZE, torch.float64)
-    images = prior.render(theta[None], SIZE)[0]
+    likelihood = ImageLikelihood.of(
+        observed(made, 1), SIZE, torch.float64, prior.category.feature_noise
+    )
+    images = prior.render(theta[None], SIZE, case == "features")[0]
     likelihood.log_density(images[None]).sum().backward()
     step = 1e-6
     moved = torch.stack([theta.detach() + step * row for row in torch.eye(prior.dim).double()])
     with torch.no_grad():
-        derivatives = (prior.render(moved, SIZE) - images) / step
+        derivatives = (prior.render(moved, SIZE, case == "features") - images) / step
     slope, information = likelihood.curvature(images.detach(), derivatives)
     torch.testing.assert_close(slope, theta.grad, rtol=0.02, atol=0.02)
     assert float(torch.linalg.eigvalsh(information).min()) > -1e-6
+    # That of features is of pixels inside the mask.
+    alone = replace(likelihood, features=likelihood.features[..., :0], feature_noise=slope[:0])
+    _, without = alone.curvature(
+        images[..., [0, 1, 2, -1]].detach(), derivatives[..., [0, 1, 2, -1]]
+    )
+    rows = derivatives[:, likelihood.known & (likelihood.mask > 0.5), 3:-1]
+    rows = (rows / likelihood.feature_noise).flatten(1)
+    torch.testing.assert_close(information - without, 0.05 * rows @ rows.T)
+
+
+def test_features_have_a_gaussian_density(cases) -> None:
+    """Inside the mask, with the noise of the category; without those that are NaN."""
+    prior, _ = cases["features"]
+    category = prior.category
+    made = make_images(prior, np.random.default_rng(4), 1, 2 * SIZE)
+    features = made.features.copy()
+    rows, columns = np.nonzero(np.nan_to_num(made.mask[0]) > 0.9)
+    features[0, rows[::7], columns[::7]] = np.nan
+    whole = ImageObservation(made.mask, None, features, prior.tangent, np.eye(3)[None])
+    theta = made.theta + 0.1
+    with torch.no_grad():
+        image = prior.render(torch.as_tensor(theta), SIZE, True)[0, 0].numpy()
+    total, unknown = 0.0, 0
+    for y in range(SIZE):
+        for x in range(SIZE):
+            block = np.s_[2 * y : 2 * y + 2, 2 * x : 2 * x + 2]
+            mask, values = made.mask[0][block], features[0][block]
+            if np.isnan(mask).any() or mask.mean() <= 0.5:
+                continue
+            mean = (mask[..., None] * values).mean(axis=(0, 1))
+            unknown += np.isnan(mean[0])
+            errors = (mean - image[y, x, 3:6]) / (2 * category.feature_noise)
+            total += 0 if np.isnan(mean[0]) else -0.5 * (errors**2).sum()
+    assert unknown > 20
+    rows = torch.as_tensor(image)[None, None]
+    soft = ImageLikelihood.of(whole, SIZE, torch.float64, category.feature_noise, 2.0)
+    alone = replace(soft, features=soft.features[..., :0], feature_noise=soft.feature_noise[:0])
+    difference = soft.log_density(rows) - alone.log_density(rows[..., [0, 1, 2, 6]])
+    assert difference.item() == pytest.approx(0.05 * total, rel=1e-5)
+
+
+def test_features_are_not_shaded(cases) -> None:
+    """They do not change with light and colours, nor colours and coverage with them."""
+    prior, made = cases["features"]
+    theta = torch.as_tensor(made.theta[:1]).clone()
+    image = prior.render(theta, SIZE, True)
+    torch.testing.assert_close(image[..., [0, 1, 2, 6]], prior.render(theta, SIZE))
+    theta[:, prior.layout.albedo.start : prior.layout.light.stop] += 1.0
+    other = prior.render(theta, SIZE, True)
+    torch.testing.assert_close(other[..., 3:], image[..., 3:])
+    assert (other[..., :3] - image[..., :3]).abs().max() > 0.05
+
+
+def test_features_tell_front_from_back(category) -> None:
+    """A symmetric body from far away has nearly the same silhouette from both sides."""
+    still = replace(category.code, mean=0 * category.code.mean)
+    prior = SurfacePrior(replace(with_made_features(category, 3), code=still), np.array([0.02]))
+    level = np.zeros((2, prior.dim))
+    level[:, prior.layout.view.start + 2] = -0.75
+    for yaw in (0.0, np.pi):
+        made = make_images(prior, np.random.default_rng(0), 2, SIZE, prior.facing(level, yaw))
+        for k, theta in enumerate(made.theta):
+            pair = np.stack([theta, prior.facing(theta, np.pi - yaw)])
+            mask = ImageObservation(made.mask[k][None], None, None, prior.tangent, np.eye(3)[None])
+            full = replace(mask, features=made.features[k][None])
+            assert abs(np.subtract(*prior.log_likelihood(pair, mask))) < 8
+            assert np.subtract(*prior.log_likelihood(pair, full)) > 100
+
+
+def test_features_of_others_are_refused(cases) -> None:
+    (plain, _), (described, made) = cases["colours"], cases["features"]
+    whole = observed(made, 0)
+    bare = replace(whole, features=None)
+    # Without features in the image, those of the category make no difference.
+    values = [prior.log_likelihood(made.theta, bare) for prior in (plain, described)]
+    np.testing.assert_array_equal(*values)
+    MotionPosterior(described, bare)
+    with pytest.raises(ValueError, match=r"image features of 3 channels, got none; leave the"):
+        MotionPosterior(plain, whole)
+    fewer = replace(whole, features=whole.features[..., :2])
+    with pytest.raises(ValueError, match=r"image features of 2 channels, got 3; leave the"):
+        MotionPosterior(described, fewer)
+
+
+def test_made_images_with_features(cases) -> None:
+    """Masks and colours are those without; features have the category's noise."""
+    (bare, _), (prior, _) = cases["colours"], cases["features"]
+    rngs = [np.random.default_rng(0) for _ in range(2)]
+    plain, again = (
+        make_images(each, rng, 6, SIZE) for each, rng in zip((bare, prior), rngs, strict=True)
+    )
+    assert plain.features is None
+    assert rngs[0].random() == rngs[1].random()
+    np.testing.assert_array_equal(again.mask, plain.mask)
+    np.testing.assert_array_equal(again.rgb, plain.rgb)
+    np.testing.assert_array_equal(np.isnan(again.features[..., 0]), np.isnan(again.mask))
+    with torch.no_grad():
+        images = prior.render(torch.as_tensor(again.theta).float(), SIZE, True)[:, 0].numpy()
+    inside = (images[..., -1] > 0.999) & np.isfinite(again.mask)
+    noise = (again.features - images[..., 3:6])[inside]
+    assert noise.std(axis=0) == pytest.approx(prior.category.feature_noise, rel=0.15)
+    features = prior.category.features
+    np.testing.assert_allclose(features.mean(axis=0), 0, atol=1e-9)
+    np.testing.assert_allclose(features.T @ features / len(features), np.eye(3), atol=1e-9)
+    vertices = prior.category.surface.vertices
+    other = np.abs((vertices * [-1, 1, 1])[:, None] - vertices).sum(axis=-1).argmin(axis=1)
+    np.testing.assert_allclose(features[other], features, atol=1e-6)
 
 
 def test_unknown_pixels_do_not_count(prior, made) -> None:
@@ -202,17 +325,21 @@ def test_light_from_one_side(prior) -> None:
     torch.testing.assert_close(radiance, expected, rtol=0, atol=0.01)
 
 
-def test_the_second_renderer_gives_the_same_density(category, made) -> None:
+def test_the_second_renderer_gives_the_same_images(cases) -> None:
     pytest.importorskip("mitsuba", reason="mitsuba is not installed")
     from probmotion.models.images.mitsuba_renderer import MitsubaRenderer
 
+    prior, made = cases["features"]
+    theta = torch.as_tensor(made.theta)
     try:
-        renderer = MitsubaRenderer(256)
-        other = SurfacePrior(category, np.array([TANGENT]), renderer)
-        images = other.render(torch.as_tensor(made.theta[:2]), SIZE)
+        other = SurfacePrior(prior.category, np.array([TANGENT]), MitsubaRenderer(256))
+        images = other.render(theta, SIZE, True)
     except (ImportError, RuntimeError, OSError) as error:
         pytest.skip(f"LLVM is not installed: {error}")
-    own = SurfacePrior(category, np.array([TANGENT])).render(torch.as_tensor(made.theta[:2]), SIZE)
-    coverage = (images[..., 3] - own[..., 3]).abs()
-    assert float(coverage.sum() / own[..., 3].sum()) < 0.03
+    own = prior.render(theta, SIZE, True)
+    coverage = (images[..., -1] - own[..., -1]).abs()
+    assert float(coverage.sum() / own[..., -1].sum()) < 0.03
     assert float((images[..., :3] - own[..., :3]).abs().mean()) < 0.002
+    inside = (images[..., -1] > 0.999) & (own[..., -1] > 0.999)
+    features = (images - own)[inside][:, 3:-1].abs().mean()
+    assert float(features / own[inside][:, 3:-1].abs().mean()) < 0.01
