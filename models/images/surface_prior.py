@@ -8,6 +8,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from probmotion.arrays import Array, to_numpy
 from probmotion.extras import torch
@@ -30,10 +31,13 @@ _SIZE = 64  # pixels; larger observations are averaged
 _PITCH, _ROLL = (0.15, 0.2), (0.0, 0.08)
 _X, _Y, _LOG_WIDTH = (0.0, 0.11), (-0.12, 0.11), (math.log(0.58), 0.18)
 # Standard deviations of the changes from one image of a clip to the next.
-_YAW_CHANGE, _TILT_CHANGE, _CENTRE_CHANGE, _WIDTH_CHANGE = 0.15, 0.04, 0.06, 0.03
+_CHANGES = (0.15, 0.04, 0.04, 0.06, 0.06, 0.03)  # of yaw, pitch, roll, x, y and log width
+_POSE_ERROR = 0.15  # of a bone's rotation that is estimated from one image, radians
 _LIGHT, _LIGHT_SPREAD = (0.0, -0.5, -0.4), 0.35
 _AMBIENT = (0.55, 0.12)
 _SAME_AXES = 1e-9
+# Rotation from a body that faces the camera to the camera's axes.
+_FLIP = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
 
 
 class SurfaceParameters(NamedTuple):
@@ -238,6 +242,29 @@ class SurfacePrior(StandardNormalPrior):
         moved[:, width] += np.log(divisor) / _LOG_WIDTH[1]
         return moved
 
+    def followed(self, theta: np.ndarray) -> np.ndarray:
+        """Return θ (dim,) of the clip from estimates of each image alone (T, dim of one image).
+
+        Motion codes become one by least squares of the poses, and bodies, colours and lights their
+        mean; changes of the view are at most a standard deviation.
+        """
+        code, at = self.category.code, self.layout
+        mean = code.turns(np.zeros(code.dim))[: self.images]
+        basis = code.turns(np.eye(code.dim))[:, : self.images] - mean
+        posed = code.turns(theta[:, at.code])[:, 0] - mean
+        rows = basis.reshape(code.dim, -1) / _POSE_ERROR
+        z = np.linalg.solve(rows @ rows.T + np.eye(code.dim), rows @ posed.ravel() / _POSE_ERROR)
+        view = theta[:, at.view.start :]
+        alone = SurfacePrior(self.category, self.tangent[:1]).parameters(torch.as_tensor(theta))
+        common = self.turned.swapaxes(1, 2) @ alone.rotation[:, 0].numpy() @ np.array(_FLIP)
+        roll, pitch, yaw = Rotation.from_matrix(common).as_euler("ZXY").T
+        places = view[:, 4:] * (_X[1], _Y[1], _LOG_WIDTH[1])
+        places[:, 2] -= np.log(self.tangent)
+        path = np.column_stack([np.unwrap(-yaw), pitch, roll, places])
+        changes = np.clip(np.diff(path, axis=0) / _CHANGES, -1.0, 1.0)
+        body = theta[:, at.lengths.start : at.view.start].mean(axis=0)
+        return np.concatenate([z, body, view[0], changes.ravel()])
+
     def middle(self, theta: np.ndarray) -> np.ndarray:
         """Return the middle of the body in the first image, ``(n, dim) → (n, 3)``, camera axes."""
         x, y, log_width = (
@@ -272,8 +299,7 @@ class SurfacePrior(StandardNormalPrior):
     def _views(self, view: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the rotations (B, T, 3, 3) from body to first camera, and roots (B, T, 3)."""
         first, later = view[:, :7], view[:, 7:].unflatten(-1, (self.images - 1, 6))
-        scales = (_YAW_CHANGE, _TILT_CHANGE, _TILT_CHANGE, _CENTRE_CHANGE, _CENTRE_CHANGE)
-        changes = later * torch.tensor((*scales, _WIDTH_CHANGE), dtype=view.dtype)
+        changes = later * torch.tensor(_CHANGES, dtype=view.dtype)
         start = torch.stack(
             [
                 torch.atan2(first[:, 0], first[:, 1]),
@@ -287,9 +313,11 @@ class SurfacePrior(StandardNormalPrior):
         )
         path = torch.cat([start[:, None], changes], dim=1).cumsum(dim=1)
         yaw, pitch, roll, x, y, log_width = path.unbind(-1)
-        rotation = _about(2, roll) @ _about(0, pitch) @ _flip(view.dtype) @ _about(1, yaw)
-        width = log_width.exp()
+        flip = torch.tensor(_FLIP, dtype=view.dtype)
+        rotation = _about(2, roll) @ _about(0, pitch) @ flip @ _about(1, yaw)
         tangent = torch.as_tensor(self.tangent, dtype=view.dtype)
+        # Without a change, the body keeps its distance when the crop becomes wider.
+        width = log_width.exp() * (tangent / tangent[0])
         middle = torch.stack([x * width, y * width, width / tangent], dim=-1)
         turned = torch.as_tensor(self.turned, dtype=view.dtype)
         middle = (turned.mT @ middle[..., None])[..., 0]
@@ -310,11 +338,6 @@ class SurfacePrior(StandardNormalPrior):
         """Return colours (B, V, 3) and the category's features, (B, V, 3 + F)."""
         features = torch.as_tensor(self.category.features, dtype=colours.dtype)
         return torch.cat([colours, features.expand(len(colours), -1, -1)], dim=-1)
-
-
-def _flip(dtype: torch.dtype) -> torch.Tensor:
-    """Return the rotation from a body that faces the camera to the camera's axes."""
-    return torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=dtype))
 
 
 def _about(axis: int, angle: torch.Tensor) -> torch.Tensor:

@@ -13,13 +13,16 @@ from probmotion.models.images.encoder import EncoderNetwork, encoder_input, para
 from probmotion.models.images.encoder_training import TANGENTS, encoder_of
 from probmotion.models.images.observation import ImageObservation
 from probmotion.models.images.surface_prior import SurfacePrior
-from probmotion.reconstruction.refinement import Mode, refine
+from probmotion.reconstruction.refinement import Mode, promising, refine
 from probmotion.reconstruction.result import Reconstruction
 from probmotion.validation import check_count
 
 __all__ = ["checked", "encoded", "mixture_draws", "posterior_modes", "reconstruct"]
 
 _STARTS, _KEPT = 6, 3  # draws from the encoder that are refined, and modes refined to the end
+# Of clips: random motions of which the best are refined, how much half of them keep of the
+# encoder's motion code, and modes refined to the end.
+_MOTIONS, _CERTAIN, _KEPT_CLIPS = 400, 0.7, 2
 _UNLIKELY = 0.02  # probability of a quarter turn below which its mean is not refined
 _UNCOVERED, _UNUSUAL = 0.1, 2.0
 """Largest values of reconstructions that can be trusted.
@@ -110,8 +113,35 @@ def posterior_modes(
     network: EncoderNetwork, prior: SurfacePrior, observed: ImageObservation, seed: int = 0
 ) -> list[Mode]:
     """Return modes of p(θ | images) that are reached from the encoder's hypotheses, best first."""
-    starts = encoded(network, prior, observed, seeds.generator(seed, "starts"), _STARTS)
-    return refine(prior, observed, starts, keep=_KEPT)
+    rng = seeds.generator(seed, "starts")
+    if observed.images == 1:
+        starts = encoded(network, prior, observed, rng, _STARTS)
+        return refine(prior, observed, starts, keep=_KEPT)
+    starts = _encoded_clip(network, prior, observed)
+    # What side a leg is of is open in single images, so that the means of the encoder hardly move.
+    tried = np.repeat(starts, -(-_MOTIONS // len(starts)), axis=0)
+    z = rng.standard_normal((len(tried), prior.category.code.dim))
+    kept = np.where(np.arange(len(tried)) % 2, 0.0, _CERTAIN)[:, None]
+    code = prior.layout.code
+    tried[:, code] = kept * tried[:, code] + np.sqrt(1 - kept**2) * z
+    starts = np.concatenate([starts, promising(prior, observed, tried, _STARTS - 1)])
+    return refine(prior, observed, starts, keep=_KEPT_CLIPS)
+
+
+def _encoded_clip(
+    network: EncoderNetwork, prior: SurfacePrior, observed: ImageObservation
+) -> np.ndarray:
+    """Return θ (m, dim) from the encoder's means for all images, for each likely quarter turn."""
+    with torch.no_grad():
+        estimates = network(encoder_input(observed.mask, observed.rgb))
+    weights = softmax(estimates.log_weights.double().mean(dim=0).numpy())
+    view, found = prior.layout.view.start, []
+    for quarter in np.argsort(-weights):
+        if weights[quarter] > _UNLIKELY:
+            turned = torch.full((observed.images,), int(quarter))
+            means = estimates.means[:, quarter].double()
+            found.append(prior.followed(parameters_of(means, turned, view).numpy()))
+    return np.stack(found)
 
 
 def encoded(
@@ -123,11 +153,10 @@ def encoded(
 ) -> np.ndarray:
     """Return the encoder's mean θ of each likely quarter turn, likeliest first, and ``n`` draws.
 
-    The encoder sees the first image. The result is (m + n, dim).
+    The encoder sees the only image. The result is (m + n, dim).
     """
-    rgb = None if observed.rgb is None else observed.rgb[:1]
     with torch.no_grad():
-        estimates = network(encoder_input(observed.mask[:1], rgb))
+        estimates = network(encoder_input(observed.mask, observed.rgb))
     weights = estimates.log_weights[0].double().exp().numpy()
     means, spreads = (part[0].double().numpy() for part in (estimates.means, estimates.log_spreads))
     order = np.argsort(-weights)
@@ -136,11 +165,9 @@ def encoded(
     noise = np.exp(spreads[drawn]) * rng.standard_normal((n, means.shape[-1]))
     values = np.concatenate([means[likely], means[drawn] + noise])
     quarters = np.concatenate([likely, drawn])
-    first = parameters_of(
-        torch.as_tensor(values), torch.as_tensor(quarters), prior.layout.view.start
-    )
-    later = np.zeros((len(values), prior.dim - first.shape[1]))
-    return np.concatenate([first.numpy(), later], axis=1)
+    view = prior.layout.view.start
+    theta = parameters_of(torch.as_tensor(values), torch.as_tensor(quarters), view)
+    return np.asarray(theta.numpy())
 
 
 def mixture_draws(modes: list[Mode], rng: np.random.Generator, n: int) -> np.ndarray:

@@ -17,7 +17,7 @@ from probmotion.models.images.image_likelihood import ImageLikelihood
 from probmotion.models.images.observation import ImageObservation
 from probmotion.models.images.surface_prior import SurfacePrior
 
-__all__ = ["Mode", "refine"]
+__all__ = ["Mode", "promising", "refine"]
 
 # Size of the images, pixels, softness of the likelihood, and largest number of steps.
 _STAGES = ((32, 4.0, 8), (64, 2.0, 6), (64, 1.0, 12))
@@ -101,6 +101,21 @@ def refine(
         modes.append(Mode(point.double().numpy(), value, precision))
     modes.sort(key=lambda mode: -mode.log_density)
     return _distinct(modes)
+
+
+def promising(
+    prior: SurfacePrior, observed: ImageObservation, candidates: np.ndarray, n: int
+) -> np.ndarray:
+    """Return the ``n`` of the candidates (m, dim) with the highest density at the first stage."""
+    size, softness, _ = _STAGES[0]
+    noise = prior.category.feature_noise
+    likelihood = ImageLikelihood.of(
+        observed, min(size, observed.size), torch.float32, noise, softness
+    )
+    rows = torch.as_tensor(candidates, dtype=torch.float32).split(_ROWS)
+    values = [_log_posterior(likelihood, part, _images(prior, part, likelihood)) for part in rows]
+    best = torch.cat(values).argsort(descending=True)[:n]
+    return np.asarray(candidates[best.numpy()])
 
 
 def _distinct(modes: list[Mode]) -> list[Mode]:
