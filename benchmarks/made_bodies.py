@@ -113,6 +113,25 @@ class Bodies:
         return np.asarray(code.turns(z))
 
 
+def impossible_masks() -> list[np.ndarray]:
+    """Return masks (SIZE, SIZE) of shapes that no body has, such as a disc or a star."""
+    y, x = (np.mgrid[:SIZE, :SIZE] + 0.5) / (0.4 * SIZE) - 1.25  # -1 to 1 inside the crop
+    radius, angle = np.hypot(x, y), np.arctan2(y, x)
+    shapes = [
+        radius < 1,
+        np.maximum(np.abs(x), np.abs(y)) < 0.8,
+        np.abs(x) + np.abs(y) < 1,
+        np.hypot(x, 2 * y) < 1,
+        np.hypot(2 * x, y) < 1,
+        (y < 0.8) & (np.abs(x) < 0.5 * (y + 0.8)),
+        radius < 0.65 + 0.35 * np.cos(3 * angle),
+        radius < 0.65 + 0.35 * np.cos(5 * angle),
+        (np.minimum(np.abs(x), np.abs(y)) < 0.3) & (radius < 1),
+        (radius > 0.6) & (radius < 1) & (x < 0.3),
+    ]
+    return [shape.astype(float) for shape in shapes]
+
+
 def rotated(prior: SurfacePrior, theta: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Return θ (n, dim) of one image with rotations (n, 3, 3) from body to camera axes."""
     angles = Rotation.from_matrix(rotation @ np.diag([1.0, -1.0, -1.0])).as_euler("ZXY")

@@ -16,7 +16,7 @@ from probmotion.models.images.observation import ImageObservation
 from probmotion.models.images.surface_prior import SurfacePrior
 from probmotion.reconstruction import Reconstruction, reconstruct
 from probmotion.reconstruction.inference import _uncovered, encoded
-from probmotion.reconstruction.refinement import Mode, refine
+from probmotion.reconstruction.refinement import Mode, promising, refine
 
 SIZE, TANGENT = 64, np.array([0.15])
 
@@ -56,6 +56,15 @@ def test_refinement_finds_the_pose_again(animal) -> None:
     radial[place] = mode.theta[place] / np.linalg.norm(mode.theta[place])
     assert np.linalg.norm(mode.theta[place]) == pytest.approx(np.sqrt(2), rel=1e-5)
     assert radial @ np.linalg.solve(mode.precision, radial) < 0.02
+
+
+def test_the_most_probable_candidates_come_first(animal) -> None:
+    _, prior, images = animal
+    others = prior.initial(np.random.default_rng(2), 60)
+    candidates = np.concatenate([others[:30], images.theta[:1], others[30:]])
+    best = promising(prior, observed(images, 0), candidates, 3)
+    np.testing.assert_array_equal(best[0], images.theta[0])
+    assert best.shape == (3, prior.dim)
 
 
 def test_estimates_of_the_network_become_parameters(animal) -> None:

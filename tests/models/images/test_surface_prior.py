@@ -315,6 +315,41 @@ def test_crops_of_a_clip_have_their_own_axes(category) -> None:
         clip.check_observations(other)
 
 
+def test_a_clip_follows_estimates_of_its_images(category) -> None:
+    """Estimates of each image alone, in its crop's axes, become the clip that they are of."""
+    code = category.code
+    same = replace(code, mean=0 * code.mean, basis=np.repeat(code.basis[:, :1], 10, axis=1))
+    angle = np.radians([0.0, 3.0, 8.0])
+    clip = SurfacePrior(
+        replace(category, code=same),
+        TANGENT * np.array([1.0, 1.1, 0.9]),
+        rotation=Rotation.from_rotvec(angle[:, None] * [0.2, 1.0, -0.1]).as_matrix(),
+    )
+    theta = clip.initial(np.random.default_rng(5), 1)[0]
+    theta[clip.layout.view.start + 7 :] *= 0.3
+    p, view = clip.parameters(torch.as_tensor(theta[None])), clip.layout.view
+    alone = np.tile(theta[: view.start + 7], (3, 1))
+    middle = (p.translation + p.rotation @ torch.as_tensor(clip._middle))[0].numpy()
+    for t in range(3):
+        roll, pitch, yaw = Rotation.from_matrix(
+            clip.turned[t] @ p.rotation[0, t].numpy() @ np.diag([1.0, -1.0, -1.0])
+        ).as_euler("ZXY")
+        x, y, z = clip.turned[t] @ middle[t]
+        width = z * clip.tangent[t]
+        alone[t, view] = [
+            math.sqrt(2) * np.sin(-yaw), math.sqrt(2) * np.cos(-yaw), (pitch - 0.15) / 0.2,
+            roll / 0.08, x / width / 0.11, (y / width + 0.12) / 0.11,
+            (np.log(width) - np.log(0.58)) / 0.18,
+        ]  # fmt: skip
+    followed = clip.followed(alone)
+    again = clip.parameters(torch.as_tensor(followed[None]))
+    torch.testing.assert_close(again.rotation, p.rotation)
+    torch.testing.assert_close(again.translation, p.translation)
+    torch.testing.assert_close(again.rest_vertices, p.rest_vertices)
+    kept = followed[clip.layout.code] @ theta[clip.layout.code]
+    assert 0.5 < kept / (theta[clip.layout.code] ** 2).sum() < 1
+
+
 def test_light_from_one_side(prior) -> None:
     """Lambert's law on a ball: ambient behind, ambient plus the cosine in front."""
     vertices, triangles = icosphere(3)
