@@ -3,8 +3,8 @@
 Poses are those of held-out clips, which the category's motion code does not reproduce exactly;
 bodies, light and views are drawn from the category. Joints are relative to their middle, in the
 size of the truth, since images determine no size; those of ``pck_01`` are in the image.
-``mask_iou_encoder``: the encoder's mean, without refinement. ``marked``: share that checks of
-reconstructions mark, and ``marked_shapes`` that of masks of no body. ``*_error``: standard errors.
+``mask_iou_encoder``: the encoder's mean, without refinement. ``flagged``: share that checks of
+reconstructions flag, and ``flagged_shapes`` that of masks of no body. ``*_error``: standard errors.
 
 ``*_without_colours``: masks alone; ``*_without_shapes``: bodies of the mean surface;
 ``*_one_hypothesis``: the encoder's likeliest quarter turn alone; ``*_with_features``: with made
@@ -139,15 +139,15 @@ def overlaps(prior: SurfacePrior, theta: np.ndarray, observation: ImageObservati
 class Estimate(NamedTuple):
     """Joints (T, J, 3) and vertices (T, V, 3) of a reconstruction, with axes as in examples.
 
-    ``draws`` (n, T, J, 3) are joints; ``mask_iou`` is a mean over images; ``marked`` is the share
-    of reconstructions that a check marks.
+    ``draws`` (n, T, J, 3) are joints; ``mask_iou`` is a mean over images; ``flagged`` is the share
+    of reconstructions that a check flags.
     """
 
     joints: np.ndarray
     vertices: np.ndarray
     draws: np.ndarray
     mask_iou: float
-    marked: float
+    flagged: float
 
 
 def reconstructed(
@@ -159,13 +159,13 @@ def reconstructed(
             reconstructed(bodies, image_of(observation, t), "", seed)
             for t in range(observation.images)
         ]
-        joints, vertices, draws, shares, marked = zip(*alone, strict=True)
+        joints, vertices, draws, shares, flagged = zip(*alone, strict=True)
         return Estimate(
             np.concatenate(joints),
             np.concatenate(vertices),
             np.concatenate(draws, axis=1),
             float(np.mean(shares)),
-            float(np.mean(marked)),
+            float(np.mean(flagged)),
         )
     prior, modes = found(bodies, observation, suffix)
     theta, images = modes[0].theta, observation.images
@@ -175,24 +175,24 @@ def reconstructed(
         prior.vertices(torch.as_tensor(theta[None]))[0].numpy(),
         prior.motion(drawn)[:, :images],
         overlaps(prior, theta, observation),
-        marked(prior, modes, drawn, observation),
+        flagged(prior, modes, drawn, observation),
     )
 
 
-def marked(
+def flagged(
     prior: SurfacePrior, modes: list[Mode], draws: np.ndarray, observation: ImageObservation
 ) -> float:
-    """Return 1 if a check marks the reconstruction, else 0."""
+    """Return 1 if a check flags the reconstruction, else 0."""
     result = Reconstruction(observation, prior, modes[0].theta, draws, ())
     return float(not inference.checked(result).trusted)
 
 
 def of_shapes(bodies: Bodies) -> Figures:
-    """Yield the share of reconstructions of masks of no body that a check marks."""
+    """Yield the share of reconstructions of masks of no body that a check flags."""
     rows = []
     for number, mask in enumerate(impossible_masks()):
         observation = ImageObservation(mask[None], None, None, np.array([TANGENT]), np.eye(3)[None])
-        rows.append({"marked": reconstructed(bodies, observation, "", number).marked})
+        rows.append({"flagged": reconstructed(bodies, observation, "", number).flagged})
     yield from means(rows, "_shapes")
 
 
@@ -205,7 +205,7 @@ def errors_of(estimate: Estimate, example: Example, length: float) -> dict[str, 
     low, high = np.quantile(scaled(estimate.draws, truth), (0.05, 0.95), axis=0)
     return {
         "mask_iou": estimate.mask_iou,
-        "marked": estimate.marked,
+        "flagged": estimate.flagged,
         "pck_01": float(correct.mean()),
         "coverage_90": float(((centred >= low) & (centred <= high)).mean()),
         **joint_errors(estimate.joints, truth, length),

@@ -68,8 +68,8 @@ class Bodies:
     def clip(self, number: int, turns: np.ndarray | None = None) -> Example:
         """Return images of a body's motion, or of other bone rotations (T, B, 3).
 
-        The direction of the camera is constant. It pans with the body, such that the middle of its
-        trunk is at one place, and all of the body is in all images. Masks have no errors.
+        The camera moves with the body without turning, such that the middle of its trunk is at one
+        place, and all of the body is in all images. Masks have no errors.
         """
         _, prior, theta = self._posed(number, self.fit.turns[number] if turns is None else turns)
         for _ in range(PASSES):

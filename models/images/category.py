@@ -232,7 +232,9 @@ class Category:
         try:
             text = json.loads(str(arrays["settings"]))
             if text["format"] != _FORMAT:
-                raise ValueError(f"format {text['format']}")
+                raise ValueError(
+                    f"format {text['format']} instead of {_FORMAT}; run probmotion train images"
+                )
             body = ArticulatedBody(Skeleton(text["joint_names"], text["parents"]), arrays["rest"])
             surface = Surface(
                 arrays["vertices"],

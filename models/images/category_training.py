@@ -49,7 +49,7 @@ def learn_surface(
 
     Features and their noise are then a linear regression on images of functions of the surface, a
     constant and smooth Gaussian ones, symmetric if the surface is. They do not change the surface:
-    those of a surface with errors would keep it as it is. If the images have no features, those of
+    those of a wrong surface would preserve its errors. If the images have no features, those of
     the category remain.
 
     Parameters
@@ -141,7 +141,7 @@ def _regressed(
     """Return the features (V, F) that explain those of images at θ of each batch, and their noise.
 
     Images of features are linear in those of the vertices. Coefficients of the smooth functions
-    have a Gaussian prior of the features' variance, which is also the noise that it assumes.
+    have a Gaussian prior; the ridge penalty assumes equal variances of coefficients and noise.
     """
     vertices = category.surface.vertices
     length = _FEATURE_LENGTH * float(np.ptp(vertices, axis=0).max())
@@ -166,7 +166,7 @@ def _regressed(
     weights = np.linalg.solve(products[:k, :k] + penalty, products[:k, k:])
     errors = np.concatenate([-weights, np.eye(channels)])
     noise = np.sqrt(np.einsum("kf,kl,lf->f", errors, products, errors).clip(min=0) / known)
-    # A channel that is 0 everywhere says nothing, whatever its noise.
+    # A channel of zeros is uninformative, whatever its noise.
     return functions @ weights, np.where(noise > 0, noise, 1.0)
 
 

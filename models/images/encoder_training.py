@@ -45,8 +45,8 @@ class EncoderTrainee:
     """Trainee for :func:`~probmotion.models.training.trainer.train`.
 
     The loss is the negative log density of the true parameters under the network's mixture. For a
-    network that has learnt this, it also has 1 − IoU of the observed silhouette and that of the
-    mean given the true quarter turn; from the beginning, this slows down learning.
+    network that has learnt this, it has 100 (1 − IoU) in addition, of the observed silhouette and
+    that of the mean given the true quarter turn; from the beginning, this slows down learning.
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ from probmotion.models.images.crops import Crop, body_box
 from probmotion.models.images.image_files import Source, read_features, read_image, read_mask
 from probmotion.validation import check_count, check_finite, check_positive, check_shape
 
-__all__ = ["ImageObservation"]
+__all__ = ["ImageObservation", "check_rotations"]
 
 _WIDEST = 120.0  # degrees; the virtual camera sees any box in an image of this field of view
 _SOURCES = (str, Path, np.ndarray)
@@ -77,6 +77,8 @@ class ImageObservation:
             rgb = np.asarray(self.rgb, dtype=np.float64)
             check_shape("rgb", rgb, (frames, size, size, 3))
             _check_shares("rgb", rgb)
+            if np.isnan(rgb[mask >= 0.5]).any():
+                raise ValueError("rgb must be known where the mask shows the body, got NaN")
             object.__setattr__(self, "rgb", rgb)
         if self.features is not None:
             features = np.asarray(self.features, dtype=np.float32)
@@ -92,15 +94,9 @@ class ImageObservation:
         check_shape("tangent", tangent, (frames,))
         check_shape("rotation", rotation, (frames, 3, 3))
         check_finite("tangent", tangent)
-        check_finite("rotation", rotation)
         if tangent.min() <= 0:
             raise ValueError(f"tangent must be above 0, got {tangent.min():g}")
-        error = np.abs(rotation @ rotation.swapaxes(1, 2) - np.eye(3)).max()
-        if error > 1e-6 or np.linalg.det(rotation).min() < 0:
-            raise ValueError(
-                f"rotation must be of rotation matrices, got a deviation of {error:.2g} from "
-                f"orthonormal ones and a determinant of {np.linalg.det(rotation).min():.3g}"
-            )
+        check_rotations("rotation", rotation)
         object.__setattr__(self, "tangent", tangent)
         object.__setattr__(self, "rotation", rotation)
 
@@ -253,6 +249,17 @@ def _view(
         crop=crop,
         shape=shape,
     )
+
+
+def check_rotations(name: str, matrices: np.ndarray) -> None:
+    """Raise ``ValueError`` unless matrices (T, 3, 3) are rotations."""
+    check_finite(name, matrices)
+    error = np.abs(matrices @ matrices.swapaxes(1, 2) - np.eye(3)).max()
+    if error > 1e-6 or np.linalg.det(matrices).min() < 0:
+        raise ValueError(
+            f"{name} must be of rotation matrices, got a deviation of {error:.2g} from "
+            f"orthonormal ones and a determinant of {np.linalg.det(matrices).min():.3g}"
+        )
 
 
 def _check_shares(name: str, values: np.ndarray) -> None:

@@ -14,7 +14,7 @@ from probmotion.arrays import Array, to_numpy
 from probmotion.extras import torch
 from probmotion.models.images.category import Category
 from probmotion.models.images.image_likelihood import ImageLikelihood
-from probmotion.models.images.observation import ImageObservation
+from probmotion.models.images.observation import ImageObservation, check_rotations
 from probmotion.models.images.posing import shaded
 from probmotion.models.images.rasterizer import Rasterizer, Renderer
 from probmotion.models.latent.standard_normal import StandardNormalPrior
@@ -127,7 +127,9 @@ class SurfacePrior(StandardNormalPrior):
         self.turned = np.tile(np.eye(3), (self.images, 1, 1))
         """From the axes of the first crop to those of each, (T, 3, 3)."""
         if rotation is not None:
+            rotation = np.asarray(rotation, dtype=np.float64)
             check_shape("rotation", rotation, (self.images, 3, 3))
+            check_rotations("rotation", rotation)
             self.turned = rotation @ rotation[0].T
         self.layout = _Layout.of(
             code.dim,
@@ -246,7 +248,7 @@ class SurfacePrior(StandardNormalPrior):
         """Return θ (dim,) of the clip from estimates of each image alone (T, dim of one image).
 
         Motion codes become one by least squares of the poses, and bodies, colours and lights their
-        mean; changes of the view are at most a standard deviation.
+        mean. The view follows the estimates by at most a standard deviation per image.
         """
         code, at = self.category.code, self.layout
         mean = code.turns(np.zeros(code.dim))[: self.images]
@@ -261,7 +263,10 @@ class SurfacePrior(StandardNormalPrior):
         places = view[:, 4:] * (_X[1], _Y[1], _LOG_WIDTH[1])
         places[:, 2] -= np.log(self.tangent)
         path = np.column_stack([np.unwrap(-yaw), pitch, roll, places])
-        changes = np.clip(np.diff(path, axis=0) / _CHANGES, -1.0, 1.0)
+        reached, changes = path[0], np.zeros((self.images - 1, len(_CHANGES)))
+        for change, estimate in zip(changes, path[1:], strict=True):
+            change[:] = np.clip((estimate - reached) / _CHANGES, -1.0, 1.0)
+            reached = reached + change * _CHANGES
         body = theta[:, at.lengths.start : at.view.start].mean(axis=0)
         return np.concatenate([z, body, view[0], changes.ravel()])
 

@@ -168,9 +168,9 @@ class TrainDenoiser:
 class TrainImages:
     """Train a kind of body for probmotion reconstruct, from clips of images and masks.
 
-    Learns the mean surface and colours in rounds and writes category.npz after each; then trains
-    the encoder and writes model.safetensors and losses.csv. Run the same command again to resume
-    an interrupted run.
+    Learns the mean surface, colours and features in rounds and writes category.npz after each; then
+    trains the encoder and writes model.safetensors and losses.csv. Run the same command again to
+    resume an interrupted run.
     """
 
     out: Path

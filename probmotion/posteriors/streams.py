@@ -77,7 +77,8 @@ def stream_draws(
     check_count("chains", chains)
     folder = writable_folder(Path(path), "stream")
     forget_killed(folder)
-    if any(folder.iterdir()) and not (folder / LOCK).exists():
+    names = {file.name for file in folder.iterdir()}
+    if names and not names & {LOCK, _LAST}:
         raise _not_a_run(path)
     with locked_folder("stream", folder), progress_bar(draws, sampler.name, progress) as bar:
         files = {file.name for file in folder.iterdir()}

@@ -20,8 +20,8 @@ from probmotion.validation import check_count
 __all__ = ["checked", "encoded", "mixture_draws", "posterior_modes", "reconstruct"]
 
 _STARTS, _KEPT = 6, 3  # draws from the encoder that are refined, and modes refined to the end
-# Of clips: random motions of which the best are refined, how much half of them keep of the
-# encoder's motion code, and modes refined to the end.
+# Clips: number of random motions, correlation of half of them with the encoder's code, and number
+# of modes that are refined to the end.
 _MOTIONS, _CERTAIN, _KEPT_CLIPS = 400, 0.7, 2
 _UNLIKELY = 0.02  # probability of a quarter turn below which its mean is not refined
 _UNCOVERED, _UNUSUAL = 0.1, 2.0
@@ -73,7 +73,7 @@ def reconstruct(
 
 def checked(result: Reconstruction) -> Reconstruction:
     """Return a reconstruction with the checks of its field of view, silhouette and shape."""
-    category = result.prior.category
+    category, shape = result.prior.category, result.theta[result.prior.layout.shape]
     return result.with_checks(
         Check(
             "field of view",
@@ -89,7 +89,9 @@ def checked(result: Reconstruction) -> Reconstruction:
         ),
         Check(
             "shape",
-            float((result.theta[result.prior.layout.shape] ** 2).mean()),
+            float(
+                (result.theta[result.prior.layout.shape] ** 2).sum() / max(len(category.shapes), 1)
+            ),
             _UNUSUAL,
             f"the surface is unlike those of the category {category.name}",
         ),
@@ -118,7 +120,7 @@ def posterior_modes(
         starts = encoded(network, prior, observed, rng, _STARTS)
         return refine(prior, observed, starts, keep=_KEPT)
     starts = _encoded_clip(network, prior, observed)
-    # What side a leg is of is open in single images, so that the means of the encoder hardly move.
+    # Single images leave left and right legs ambiguous, so that the encoder's means hardly move.
     tried = np.repeat(starts, -(-_MOTIONS // len(starts)), axis=0)
     z = rng.standard_normal((len(tried), prior.category.code.dim))
     kept = np.where(np.arange(len(tried)) % 2, 0.0, _CERTAIN)[:, None]

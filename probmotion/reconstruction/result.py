@@ -32,7 +32,7 @@ _SIDES, _DEPTHS = ("right", "left"), ("towards the camera", "away from the camer
 class Reconstruction:
     """Posterior of a body given one image or the T images of a clip.
 
-    Axes are the image's right, up, and towards the camera, which is at the origin.
+    Axes are right, up, and towards the camera, which is at the origin, in the first image's crop.
 
     Parameters
     ----------

@@ -164,10 +164,17 @@ def test_folders_in_use_and_other_folders_are_refused(posterior, tmp_path):
         pm.open_draws(tmp_path)
     (tmp_path / "notes.txt").unlink()
     with locked_folder("stream", tmp_path):
-        for unfinished in ("nothing yet", "last.nc.partial"):
+        for unfinished in (".lock", "last.nc.partial"):
+            (tmp_path / unfinished).touch()
             with pytest.raises(ValueError, match="to which another process writes"):
                 streams.stream_draws(SAMPLERS["mh"], posterior, tmp_path, **RUN)
-            (tmp_path / unfinished).touch()
+
+
+def test_runs_that_were_copied_without_their_lock_are_continued(posterior, tmp_path):
+    streams.stream_draws(SAMPLERS["mh"], posterior, tmp_path, **{**RUN, "draws": 5})
+    (tmp_path / ".lock").unlink()
+    draws = streams.stream_draws(SAMPLERS["mh"], posterior, tmp_path, **RUN)
+    assert draws.positions.sizes["draw"] == RUN["draws"]
 
 
 def test_damaged_draws_are_not_believed(posterior, tmp_path):

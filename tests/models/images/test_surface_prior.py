@@ -346,6 +346,11 @@ def test_a_clip_follows_estimates_of_its_images(category) -> None:
     torch.testing.assert_close(again.rotation, p.rotation)
     torch.testing.assert_close(again.translation, p.translation)
     torch.testing.assert_close(again.rest_vertices, p.rest_vertices)
+    jump = np.copy(alone)  # which is reached later, by one standard deviation per image
+    jump[1:, view.start + 4] += 0.09 / 0.11
+    x = clip.followed(jump)[view][[10, 16]] - followed[view][[10, 16]]
+    np.testing.assert_allclose(followed[view][10] + x[0], 1.0)
+    np.testing.assert_allclose(0.06 * x.sum(), 0.09)
     kept = followed[clip.layout.code] @ theta[clip.layout.code]
     assert 0.5 < kept / (theta[clip.layout.code] ** 2).sum() < 1
 
