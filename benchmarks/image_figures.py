@@ -159,13 +159,13 @@ def reconstructed(
             reconstructed(bodies, image_of(observation, t), "", seed)
             for t in range(observation.images)
         ]
-        joints, vertices, draws, shares, flagged = zip(*alone, strict=True)
+        joints, vertices, draws, shares, failed = zip(*alone, strict=True)
         return Estimate(
             np.concatenate(joints),
             np.concatenate(vertices),
             np.concatenate(draws, axis=1),
             float(np.mean(shares)),
-            float(np.mean(flagged)),
+            float(np.mean(failed)),
         )
     prior, modes = found(bodies, observation, suffix)
     theta, images = modes[0].theta, observation.images

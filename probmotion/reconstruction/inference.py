@@ -89,9 +89,7 @@ def checked(result: Reconstruction) -> Reconstruction:
         ),
         Check(
             "shape",
-            float(
-                (result.theta[result.prior.layout.shape] ** 2).sum() / max(len(category.shapes), 1)
-            ),
+            float((shape**2).sum() / max(len(shape), 1)),
             _UNUSUAL,
             f"the surface is unlike those of the category {category.name}",
         ),
