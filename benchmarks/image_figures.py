@@ -183,7 +183,9 @@ def flagged(
     prior: SurfacePrior, modes: list[Mode], draws: np.ndarray, observation: ImageObservation
 ) -> float:
     """Return 1 if a check flags the reconstruction, else 0."""
-    result = Reconstruction(observation, prior, modes[0].theta, draws, ())
+    # The checks do not depend on features, which the category may not have.
+    observed = replace(observation, features=None)
+    result = Reconstruction(observed, prior, modes[0].theta, draws, ())
     return float(not inference.checked(result).trusted)
 
 
