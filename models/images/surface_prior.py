@@ -322,7 +322,7 @@ class SurfacePrior(StandardNormalPrior):
         rotation = _about(2, roll) @ _about(0, pitch) @ flip @ _about(1, yaw)
         tangent = torch.as_tensor(self.tangent, dtype=view.dtype)
         # Without a change, the body keeps its distance when the crop becomes wider.
-        width = log_width.exp() * (tangent / tangent[0])
+        width = log_width.exp() * (tangent / tangent[..., :1])
         middle = torch.stack([x * width, y * width, width / tangent], dim=-1)
         turned = torch.as_tensor(self.turned, dtype=view.dtype)
         middle = (turned.mT @ middle[..., None])[..., 0]
