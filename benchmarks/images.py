@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
 from lift import peak_gib
+from made_bodies import Bodies
 
 from probmotion.models.images.category import Category
 from probmotion.models.images.encoder import encoder_input
@@ -70,7 +72,11 @@ def main() -> None:
     start = time.perf_counter()
     for each in observed:
         reconstruct(each, category)
-    print(f"reconstruct_seconds: {(time.perf_counter() - start) / RECONSTRUCTED:.4g}")
+    print(f"reconstruct_seconds: {(time.perf_counter() - start) / RECONSTRUCTED:.4g}", flush=True)
+    clip = replace(Bodies("quadruped", None, "validation", 1).clip(0).observation, features=None)
+    start = time.perf_counter()
+    reconstruct(clip, category)
+    print(f"clip_seconds: {time.perf_counter() - start:.4g}")
     print(f"peak_gib: {peak_gib():.2f}")
 
 

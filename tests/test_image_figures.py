@@ -130,3 +130,29 @@ def test_keypoints_are_transferred_by_what_is_seen_of_the_surface(script, catego
     assert true.transferred(view(joints, category.surface, wrong=60)) < 0.5
     mask[:] = np.nan
     assert np.isnan(true.transferred(view(joints, category.surface)))
+
+
+def test_every_ablation_changes_one_thing(script, monkeypatch):
+    """What is refined without colours, shapes, hypotheses or the motion prior, or with features."""
+    bodies = script.Bodies("quadruped", None, "validation", 1)
+    starts = 0.1 * np.ones((4, script.SurfacePrior(bodies.category, np.ones(1)).dim))
+    monkeypatch.setattr(script.inference, "encoded", lambda *args: starts)
+    monkeypatch.setattr(
+        script.inference, "posterior_modes", lambda _, prior, seen: ((prior, seen, starts))
+    )
+    monkeypatch.setattr(
+        script, "refine", lambda prior, seen, starts, keep=None: (prior, seen, starts)
+    )
+
+    def what(suffix):
+        prior, seen, starts = script.found(bodies, bodies.image(0).observation, suffix)[1]
+        return {
+            "_without_colours": seen.rgb is None,
+            "_without_shapes": bool(np.abs(prior.category.shapes).max() < 1e-6),
+            "_one_hypothesis": len(starts) == 1,
+            "_with_features": seen.features is not None,
+            "_without_motion_prior": prior.category.code.frames == 1,
+        }
+
+    for suffix in ("", *script.ABLATIONS):
+        assert what(suffix) == {name: name == suffix for name in script.ABLATIONS}

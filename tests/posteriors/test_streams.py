@@ -168,6 +168,9 @@ def test_folders_in_use_and_other_folders_are_refused(posterior, tmp_path):
             (tmp_path / unfinished).touch()
             with pytest.raises(ValueError, match="to which another process writes"):
                 streams.stream_draws(SAMPLERS["mh"], posterior, tmp_path, **RUN)
+    # A lock alone does not make other files a run.
+    with pytest.raises(ValueError, match="stream must be a new folder or one of a run"):
+        streams.stream_draws(SAMPLERS["mh"], posterior, tmp_path, **RUN)
 
 
 def test_runs_that_were_copied_without_their_lock_are_continued(posterior, tmp_path):

@@ -297,7 +297,8 @@ def test_crops_of_a_clip_have_their_own_axes(category) -> None:
     """A camera that follows a still body turns; the body does not."""
     axis, angle = np.array([0.2, 1.0, -0.1]), np.radians([5.0, 20.0, 40.0])
     rotation = Rotation.from_rotvec(angle[:, None] * axis).as_matrix()
-    clip = SurfacePrior(category, np.full(3, TANGENT), rotation=rotation)
+    tangent = TANGENT * np.array([1.0, 1.2, 0.9])
+    clip = SurfacePrior(category, tangent, rotation=rotation)
     theta = clip.initial(np.random.default_rng(4), 1)
     theta[:, clip.layout.view.start + 7 :] = 0.0
     p = clip.parameters(torch.as_tensor(theta))
@@ -308,7 +309,9 @@ def test_crops_of_a_clip_have_their_own_axes(category) -> None:
     np.testing.assert_allclose(seen @ rotation, common @ rotation[0], atol=1e-9)
     middle = (p.translation + p.rotation @ torch.as_tensor(clip._middle))[0].numpy()
     in_crop = ((middle @ rotation[0])[:, None] @ rotation.swapaxes(1, 2))[:, 0]
-    np.testing.assert_allclose(in_crop, np.repeat(clip.middle(theta), 3, axis=0), atol=1e-9)
+    # It keeps its distance, and its place in units of the crop.
+    scale = np.stack([tangent / TANGENT, tangent / TANGENT, np.ones(3)], axis=1)
+    np.testing.assert_allclose(in_crop, clip.middle(theta) * scale, atol=1e-9)
     mask = np.pad(np.ones((3, 16, 16)), ((0, 0), (8, 8), (8, 8)))
     other = ImageObservation(mask, None, None, clip.tangent, rotation[::-1])
     with pytest.raises(ValueError, match="the prior's rotation, got a difference of 1"):
