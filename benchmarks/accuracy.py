@@ -1,7 +1,7 @@
 """Accuracy of priors that are learnt from real motion, and of diffusion samplers.
 
-Prints ``name: value`` lines. ``diffusion``: metrics of 400 draws (split Gibbs: 200, with five 2D
-views), mean over seeds.
+Prints ``name: value`` lines. ``diffusion``: metrics of 400 draws (split Gibbs: 200, with 2D
+denoisers), mean over seeds.
 
 ``learnt``: see :func:`learnt_figures`.
 
@@ -421,7 +421,10 @@ def diffusion_figures() -> Figures:
         ),
         (
             "mvpc", "cmu", MultiViewPredictorCorrector(), 400, 3,
-            {"swd": "swd_ratio", "off_manifold": "off_manifold_ratio"},
+            {
+                "swd": "swd_ratio", "variance": "variance_ratio",
+                "off_manifold": "off_manifold_ratio", "c2st": "c2st",
+            },
         ),
         (
             "split_gibbs", "gait-monocular", SplitGibbs(**with_views), 200, 2,

@@ -1,4 +1,4 @@
-"""Atomic file writes, locks and checksums, and safe reading of archives and JSON."""
+"""Atomic file writes, locks, checksums and formats, and safe reading of archives and JSON."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import sys
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, MutableMapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 __all__ = [
     "LOCK",
     "UNSEALED",
+    "check_format",
     "forget_killed",
     "locked_folder",
     "member_array",
@@ -240,6 +241,20 @@ def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
     with open_archive(Path(path).read_bytes()) as archive:
         names = [name for name in archive.namelist() if name.endswith(".npy")]
         return {key: member_array(archive, key) for key in (n.removesuffix(".npy") for n in names)}
+
+
+def check_format(content: MutableMapping[str, Any]) -> None:
+    """Remove the entry ``format`` of a stored file; raise ``ValueError`` unless it is 1.
+
+    Files without the entry have format 1.
+    """
+    import numpy as np
+
+    got = np.asarray(content.pop("format", 1)).tolist()
+    if got != 1:
+        raise ValueError(
+            f"format must be 1, got {got!r:.20}; use the version of probmotion that wrote the file"
+        )
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

@@ -228,8 +228,8 @@ class Category:
             raise FileNotFoundError(
                 f"category must be a file or one of {', '.join(names)}, got {source}"
             )
-        arrays = read_arrays(path)
         try:
+            arrays = read_arrays(path)
             text = json.loads(str(arrays["settings"]))
             if text["format"] != _FORMAT:
                 raise ValueError(

@@ -97,9 +97,16 @@ class _Rasterize(torch.autograd.Function):
         # A pixel at depth z covers 2 tangent z / size metres.
         tolerance = _SAME_SURFACE * 2 * tangent / size
         edges = _edges(triangles)
-        plain, faces, nearness = _visible(*inputs, triangles, size)
+        n, _, channels = inputs[2].shape
+        plain, nearness = np.zeros((n, size, size, channels + 1)), np.zeros((n, size, size))
+        faces = np.full((n, size, size), -1, dtype=np.int64)
+        # After Ctrl-C, compiled functions that return several arrays raise SystemError.
+        _visible(plain, faces, nearness, *inputs, triangles)
         image = plain.copy()
-        crossings = _crossings(nearness, *inputs[:2], triangles, edges, tolerance)
+        most = _most_crossings(*inputs[:2], triangles, edges, size)
+        places, values = np.empty((most, 7), dtype=np.int64), np.empty((most, 3))
+        count = _crossings(places, values, nearness, *inputs[:2], triangles, edges, tolerance)
+        crossings = places[:count], values[:count]
         _blend(image, plain, *inputs[1:], edges, *crossings)
         context.state = (*inputs, triangles, edges, plain, faces, *crossings)
         context.dtype = screen.dtype
@@ -154,14 +161,17 @@ def _seen(screen: np.ndarray, inverse: np.ndarray, triangle: np.ndarray) -> bool
 
 @numba.njit(cache=True)
 def _visible(
-    screen: np.ndarray, inverse: np.ndarray, colours: np.ndarray, triangles: np.ndarray, size: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return images without antialiasing, the visible triangles, −1 for none, and 1 / depth."""
-    n, channels = len(screen), colours.shape[2]
-    image = np.zeros((n, size, size, channels + 1))
-    faces = np.full((n, size, size), -1, dtype=np.int64)
-    nearness = np.zeros((n, size, size))
-    for i in range(n):
+    image: np.ndarray,
+    faces: np.ndarray,
+    nearness: np.ndarray,
+    screen: np.ndarray,
+    inverse: np.ndarray,
+    colours: np.ndarray,
+    triangles: np.ndarray,
+) -> None:
+    """Fill images without antialiasing, the visible triangles (of −1, for none), and 1 / depth."""
+    size, channels = nearness.shape[1], colours.shape[2]
+    for i in range(len(screen)):
         for t in range(len(triangles)):
             if not _seen(screen[i], inverse[i], triangles[t]):
                 continue
@@ -194,7 +204,6 @@ def _visible(
                                 + w * inverse[i, c] * colours[i, c, k]
                             ) / near
                         image[i, row, column, channels] = 1.0
-    return image, faces, nearness
 
 
 @numba.njit(cache=True)
@@ -315,21 +324,10 @@ def _lines(p: np.ndarray, q: np.ndarray, axis: int, size: int) -> tuple[int, int
 
 
 @numba.njit(cache=True)
-def _crossings(
-    nearness: np.ndarray,
-    screen: np.ndarray,
-    inverse: np.ndarray,
-    triangles: np.ndarray,
-    edges: np.ndarray,
-    tolerance: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return where visible silhouettes pass between neighbouring pixels.
-
-    Of each of N crossings: image, edge, axis, row and column of the pixel inside and of the one
-    outside, (N, 7); the distance t from the former, the fraction s of the edge, and the share of
-    rows or columns in the blending of this edge, (N, 3).
-    """
-    size = nearness.shape[1]
+def _most_crossings(
+    screen: np.ndarray, inverse: np.ndarray, triangles: np.ndarray, edges: np.ndarray, size: int
+) -> int:
+    """Return the number of crossings of silhouettes and centre lines, visible or not."""
     most = 0
     for i in range(len(screen)):
         for e in range(len(edges)):
@@ -337,7 +335,27 @@ def _crossings(
                 for axis in range(2):
                     first, end = _lines(screen[i, edges[e, 0]], screen[i, edges[e, 1]], axis, size)
                     most += max(end - first, 0)
-    places, values = np.empty((most, 7), dtype=np.int64), np.empty((most, 3))
+    return most
+
+
+@numba.njit(cache=True)
+def _crossings(
+    places: np.ndarray,
+    values: np.ndarray,
+    nearness: np.ndarray,
+    screen: np.ndarray,
+    inverse: np.ndarray,
+    triangles: np.ndarray,
+    edges: np.ndarray,
+    tolerance: float,
+) -> int:
+    """Find where visible silhouettes pass between neighbouring pixels; return the number N.
+
+    The first N rows are filled. ``places`` (most, 7): image, edge, axis, row and column of the
+    pixel inside and of the one outside; ``values`` (most, 3): the distance t from the former, the
+    fraction s of the edge, and the share of rows or columns in the blending of this edge.
+    """
+    size = nearness.shape[1]
     count = 0
     for i in range(len(screen)):
         for e in range(len(edges)):
@@ -360,7 +378,7 @@ def _crossings(
                     values[count, 0], values[count, 1] = t, s
                     values[count, 2] = (q[1 - axis] - p[1 - axis]) ** 2 / length
                     count += 1
-    return places[:count], values[:count]
+    return count
 
 
 @numba.njit(cache=True)

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from probmotion.files import read_arrays, written_whole
+from probmotion.files import check_format, read_arrays, written_whole
 from probmotion.models.pose_pairs.joint_limits_kernels import PARTS, LimitArrays, project_poses
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_count, check_finite, check_shape
@@ -158,6 +158,7 @@ class JointLimits:
         with written_whole(Path(path)) as unfinished:
             np.savez_compressed(
                 unfinished,
+                format=np.array(1),
                 allowed=np.packbits(self.allowed, axis=-1),
                 rest=self.rest,
                 tilt=self.tilt,
@@ -170,6 +171,7 @@ class JointLimits:
         """Read limits written by :meth:`save`; raise ``ValueError`` if the file is damaged."""
         try:
             arrays = read_arrays(path)
+            check_format(arrays)
             bin_rings, cell_rings = (int(number) for number in arrays["rings"])
             if max(bin_rings, cell_rings) > _MAX_RINGS:
                 raise ValueError(f"rings must be at most {_MAX_RINGS}, got {arrays['rings']}")
@@ -184,7 +186,8 @@ class JointLimits:
             )
         except (KeyError, TypeError, ValueError, RecursionError) as error:
             raise ValueError(
-                f"path must be a file written by JointLimits.save, got {str(path)!r}"
+                f"path must be a file written by JointLimits.save, got {str(path)!r} "
+                f"({str(error)[:120]})"
             ) from error
 
 

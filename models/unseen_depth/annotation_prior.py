@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from probmotion.arrays import logsumexp
-from probmotion.files import read_arrays, written_whole
+from probmotion.files import check_format, read_arrays, written_whole
 from probmotion.interaction.annotations.annotations import Annotations
 from probmotion.interaction.annotations.sources import ELEVATIONS, world_axes
 from probmotion.models.unseen_depth.em import Poses, expectation, maximisation
@@ -283,6 +283,7 @@ class AnnotationPrior:
             np.savez(
                 file,
                 allow_pickle=False,
+                format=np.array(1),
                 weights=self.weights,
                 means=self.means,
                 covariances=self.covariances,
@@ -295,11 +296,13 @@ class AnnotationPrior:
         """Read an archive written by :meth:`save`."""
         try:
             arrays = read_arrays(path)
+            check_format(arrays)
             noise = float(arrays.pop("noise"))
             return cls(noise=noise, **arrays)
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(
-                f"{path} must be an archive written by AnnotationPrior.save, got an unreadable file"
+                f"{path} must be an archive written by AnnotationPrior.save, got an unreadable "
+                f"file ({str(error)[:120]})"
             ) from error
 
     @cached_property

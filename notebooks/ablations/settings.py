@@ -100,17 +100,15 @@ def conditional_methods(budget: int) -> dict[str, Sampler]:
         "red-diff": REDDiff(denoiser="2d", steps=estimates),
         "sync-tweedies": SyncTweedies(steps=estimates),
         "stoch-sync": StochSync(steps=estimates // 5),
+        "tds": TwistedDiffusion(denoiser="2d", particles=estimates // 50),
     }
-    if budget > 500:
-        particles = max(2, estimates // 50)
-        samplers["tds"] = TwistedDiffusion(denoiser="2d", particles=particles)
     return {f"{name}, {budget}": sampler for name, sampler in samplers.items()}
 
 
 STUDIES = {
     "integrators": Study(
         "integrators and noise levels at 50 evaluations of a 3D denoiser",
-        ("gait", "cmu", "quadruped", "gait-monocular", "cmu-monocular"),
+        ("gait", "cmu", "quadruped", *CONDITIONED),
         {
             "ddpm, cosine": Ancestral3D(levels=Cosine(), integrator=DDPM()),
             "second order, cosine": Ancestral3D(levels=Cosine()),
@@ -165,6 +163,11 @@ STUDIES = {
             for budget in BUDGETS
             for name, sampler in conditional_methods(budget).items()
         },
+    ),
+    "split-gibbs": Study(
+        "split Gibbs with denoisers of 3D motion and of 2D views",
+        CONDITIONED,
+        {f"split-gibbs, {kind}": SplitGibbs(denoiser=kind) for kind in ("3d", "2d")},
     ),
     "views": Study(
         "number of views, and noise shared between views",

@@ -12,7 +12,7 @@ import numpy as np
 
 from probmotion.calibration.error_measures import MEASURES
 from probmotion.comparison.results.fingerprint import fingerprint
-from probmotion.files import read_json, write_json, written_whole
+from probmotion.files import check_format, read_json, write_json, written_whole
 from probmotion.metrics.intervals import t_interval
 from probmotion.validation import check_types
 
@@ -146,7 +146,9 @@ class StoredValues:
     def _read(self) -> _StoredFile:
         assert self.path is not None
         try:
-            stored = _StoredFile(**read_json(self.path))
+            content = dict(read_json(self.path))
+            check_format(content)
+            stored = _StoredFile(**content)
             check_types(stored)
         except (TypeError, ValueError) as error:
             raise ValueError(
@@ -163,7 +165,8 @@ class StoredValues:
         self._values[f"{name} {seed}"] = values
         if self.path is None:
             return
-        write_json(self.path, {"question": self.question, "values": self._values})
+        content = {"format": 1, "question": self.question, "values": self._values}
+        write_json(self.path, content)
 
 
 def _with_interval(row: Any) -> str:

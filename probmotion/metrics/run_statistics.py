@@ -173,6 +173,8 @@ def draw_statistics(
     ratios = {}
     for name, values in _positive(own, leading).items():
         against = reference.positive[name]
+        # Equal draws have no variance, or that of rounding.
+        values = np.maximum(values, np.finfo(float).eps ** 2 * against.mean())
         ratios[name] = [
             math.log(values.mean() / against.mean()),
             _relative_variance(values) + n / len(against) * _relative_variance(against),

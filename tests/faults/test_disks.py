@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import warnings
 from contextlib import suppress
+from functools import cache
 
 import numpy as np
 import pytest
@@ -13,13 +15,19 @@ from own_files import OWN, write_comparison
 
 import probmotion as pm
 from probmotion import files
+from probmotion.calibration.error_result import ErrorDecomposition
 from probmotion.cli.main import main
 from probmotion.comparison import Comparison
+from probmotion.comparison.measurements import save_measurements
 from probmotion.data.synthetic.gaits import make_gait
 from probmotion.io.npz import write_npz
+from probmotion.models.images.category import Category
+from probmotion.models.mixture import SpectralMixtureMotion
 from probmotion.motion.motion import Motion
 from probmotion.plots.skeletons import draw_skeletons
 from probmotion.posteriors import streams
+from probmotion.problems.references import chains
+from probmotion.problems.references.chains import StoredChain
 
 WALK = make_gait("walk", 0, frames=60, fps=30.0)
 CLIPS = "--size tiny --validation walk3 --test walk4 --batch 4 --checkpoint-every 2"
@@ -29,6 +37,17 @@ def run(*words):
     """Run a command; raise an error if it ends with the status of an error."""
     if main([str(word) for word in words]) == 2:
         raise OSError
+
+
+def results(folder, number):
+    """Return the results of a grid in another folder; the second has larger files."""
+    if not (folder.parent / "grid1").exists():
+        for grid in (folder.parent / "grid1", folder.parent / "grid2"):
+            grid.mkdir()
+            write_comparison(grid)
+        with open(grid / "runs/filmed/good/0/draws.nc", "ab") as file:
+            file.write(bytes(100_000))
+    return Comparison.load(folder.parent / f"grid{number}")
 
 
 def compare(folder, number):
@@ -62,11 +81,23 @@ def denoise(folder, number):
     run("denoise", source, "--draws", 2, "--out", folder)
 
 
-def report(folder, number):
-    if number == 1:
-        (folder.parent / "comparison").mkdir()
-        write_comparison(folder.parent / "comparison")
-    Comparison.load(folder.parent / "comparison").report(folder / "report.html")
+def calibrate(folder, number):
+    simulations = {"simulations": 10 * number, "draws": 20, "chains": 1}
+    pm.calibrate("gait(frames=8)", "exact", **simulations, out=folder, workers=0, progress=False)
+
+
+def decompose(folder, number):
+    rows = [{"swd_ratio": 1.0 + seed, "seconds": 1.0} for seed in range(3)]
+    ErrorDecomposition("walk", {"exact": rows, "mas": rows[::-1]}).write(folder / "errors.csv")
+
+
+def store_chain(folder, number):
+    """Store a chain; its errors are warnings, as sampling continues."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        StoredChain(folder / "chain.npz").save(lambda: {"poses": np.full((99, 99), number)})
+    for warning in caught:
+        raise OSError(str(warning.message))
 
 
 def lift(folder, number):
@@ -76,13 +107,75 @@ def lift(folder, number):
     pm.lift(filmed, image_size=(1000, 1000), draws=2).save(folder)
 
 
+def lift_pairs(folder, number):
+    pairs().save(folder)
+
+
+@cache
+def pairs():
+    """Return two people in 60 frames, without a lift."""
+    from probmotion.data.synthetic.dances import synthetic_dances
+    from probmotion.interaction.annotations import Annotations
+    from probmotion.lifting import LiftedPairs
+    from probmotion.models.unseen_depth import AnnotationPrior
+
+    dance = synthetic_dances(1, frames=60, seed=5)[0]
+    keypoints, spread = dance.positions[..., :2], np.full(dance.positions.shape, 0.1)
+    seen = np.ones(keypoints.shape[:2], bool)
+    neighbours = np.full((len(keypoints), 2, *keypoints.shape[1:]), np.nan)
+    annotations = Annotations(keypoints, seen, dance.skeleton, neighbours, dance.fps)
+    poses = dance.positions[:1] - dance.positions[:1].mean(axis=1, keepdims=True)
+    prior = AnnotationPrior(np.ones(1), poses, 0.1 * np.eye(102)[None], 0.03, np.zeros((1, 2)))
+    return LiftedPairs(
+        dance, spread, dance.positions[None], keypoints, 0.0, annotations, prior, -1.0
+    )
+
+
+def reconstruct(folder, number):
+    reconstruction().save(folder)
+
+
+@cache
+def reconstruction():
+    """Return a made image with draws about its truth."""
+    from probmotion.models.images.made_images import make_images
+    from probmotion.models.images.observation import ImageObservation
+    from probmotion.models.images.surface_prior import SurfacePrior
+    from probmotion.reconstruction import Reconstruction
+
+    rng = np.random.default_rng(0)
+    prior = SurfacePrior(Category.load("quadruped"), np.array([0.15]))
+    made = make_images(prior, rng, 1, 64)
+    observation = ImageObservation(made.mask, made.rgb, None, prior.tangent, np.eye(3)[None])
+    draws = made.theta + 0.2 * rng.normal(size=(4, prior.dim))
+    return Reconstruction(observation, prior, made.theta[0], draws, ())
+
+
+@cache
+def shipped(kind, name):
+    return kind.load(name)
+
+
 WRITERS = {
     "grid": compare,
     "stream": stream,
     "training": train,
     "denoise": denoise,
-    "report": report,
+    "report": lambda folder, number: results(folder, 1).report(folder / "report.html"),
+    "results": lambda folder, number: results(folder, number).write(folder),
+    "measurements": lambda folder, number: save_measurements(
+        results(folder, number), f"command {number}", folder
+    ),
+    "calibration": calibrate,
+    "decomposition table": decompose,
+    "chain": store_chain,
     "lift": lift,
+    "lifted pairs": lift_pairs,
+    "reconstruction": reconstruct,
+    "spectral prior": lambda folder, number: shipped(SpectralMixtureMotion, "cmu-motion").save(
+        folder / "prior.npz"
+    ),
+    "category": lambda folder, number: shipped(Category, "quadruped").save(folder / "c.npz"),
     "figure": lambda folder, number: draw_skeletons(
         {"walk": WALK.positions[None]}, WALK.skeleton, folder / "walk.png"
     ),
@@ -93,17 +186,19 @@ WRITERS = {
     **{
         kind: lambda folder, number, write=OWN[kind][0]: write(folder)
         for kind in (
-            "draws", "reference", "annotations", "annotation prior", "joint limits", "checkpoint",
-            "decomposition", "stored problem",
+            "draws", "reference", "annotations", "annotation prior", "pose depth", "joint limits",
+            "checkpoint", "decomposition", "stored problem",
         )
     },
 }  # fmt: skip
-ALL = [pytest.param(n, marks=[pytest.mark.slow] if n == "lift" else [], id=n) for n in WRITERS]
+SLOW = ("lift", "reconstruction", "spectral prior")
+ALL = [pytest.param(n, marks=[pytest.mark.slow] if n in SLOW else [], id=n) for n in WRITERS]
 
 
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch):
     monkeypatch.setattr(streams, "_BLOCK_BYTES", 80_000)
+    monkeypatch.setattr(chains, "_SECONDS", 0.0)
 
 
 def contents(folder):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import itertools
 import os
 import resource
@@ -14,14 +15,17 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from toy_samplers import SMALL, PriorDraws, generation, numbers
-from victims import Process
+from victims import Process, weights
 
 import probmotion as pm
-from probmotion.comparison import compare
+from probmotion.cli.main import main
+from probmotion.comparison import Comparison, compare
 from probmotion.comparison.results.failures import TimeLimitExceeded
 from probmotion.comparison.run.time_limits import time_limit
 from probmotion.data.synthetic.gaits import make_gait
 from probmotion.files import locked_folder
+from probmotion.models.training.checkpoints import load_checkpoint
+from probmotion.posteriors import streams
 
 
 @dataclass(frozen=True)
@@ -50,12 +54,97 @@ class Killed(PriorDraws):
         os.kill(os.getpid(), signal.SIGKILL)
 
 
-def test_results_do_not_depend_on_the_clock(monkeypatch, account):
+@pytest.fixture
+def set_clock(monkeypatch):
+    """Function after which the clock of the computer is set back and forth at each reading."""
+
+    def jump():
+        jumps = itertools.accumulate(itertools.cycle([3_000_000, -7_000_000]))
+        now, today = time.time, datetime.date.today()
+
+        class Date(datetime.date):
+            @classmethod
+            def today(cls):
+                return today + datetime.timedelta(seconds=next(jumps))
+
+        monkeypatch.setattr(time, "time", lambda: now() + next(jumps))
+        monkeypatch.setattr(time, "time_ns", lambda: int(1e9 * time.time()))
+        monkeypatch.setattr(datetime, "date", Date)
+
+    return jump
+
+
+def touch(folder):
+    """Give files a time of change in the past or future."""
+    for number, path in enumerate(sorted(folder.rglob("*"))):
+        os.utime(path, (1e9, 1e9) if number % 2 else (4e9, 4e9))
+
+
+def stream(folder, number):
+    posterior = pm.problem("gait-monocular", frames=6).posterior
+    sampler = pm.samplers.MetropolisHastings(warmup=20, thin=1)
+    options = {"draws": 80 * number, "chains": 2, "progress": False}
+    return pm.sample(posterior, sampler, stream=folder, **options)
+
+
+def stream_results(folder):
+    draws = pm.open_draws(folder)
+    return draws.positions.values.tobytes(), [draws.seconds]
+
+
+def train(folder, number):
+    clips = folder.parent / "clips"
+    if not clips.exists():
+        clips.mkdir()
+        for walk in range(5):
+            pm.save(make_gait("walk", walk, frames=40, fps=30.0), clips / f"walk{walk}.npz")
+    words = "--size tiny --validation walk3 --test walk4 --batch 4 --checkpoint-every 2"
+    more = ["--clips", f"{clips}/walk*.npz", "--steps", f"{4 * number}", "--out", f"{folder}"]
+    assert main(["train", "dvae", *words.split(), *more]) == 0
+
+
+def train_results(folder):
+    history = load_checkpoint(folder / "model.safetensors", "motion-dvae").settings["history"]
+    return weights(folder), [row["seconds"] for row in history]
+
+
+def grid(folder, number):
+    return compare(generation(), PriorDraws(), seeds=number, out=folder, **SMALL)
+
+
+def grid_results(folder):
+    table = Comparison.load(folder).table()
+    return numbers(table), table.set_index("metric")["value"]["seconds"]
+
+
+RESUMED = {
+    "streamed chain": (stream, stream_results),
+    "training": (train, train_results),
+    "grid in a folder": (grid, grid_results),
+}
+
+
+@pytest.mark.parametrize("name", RESUMED)
+def test_resumed_runs_do_not_depend_on_the_clock(name, tmp_path, set_clock, account, monkeypatch):
+    """The clock is set before a run is resumed and at each reading, and files are of any time."""
+    monkeypatch.setattr(streams, "_BLOCK_BYTES", 80_000)
+    run, results = RESUMED[name]
+    run(tmp_path / "undisturbed", 2)
+    expected, _ = results(tmp_path / "undisturbed")
+    set_clock()
+    with account("clock", name):
+        run(tmp_path / "out", 1)
+        touch(tmp_path / "out")
+        run(tmp_path / "out", 2)
+        got, seconds = results(tmp_path / "out")
+        assert got == expected
+        assert all(0 <= second < 600 for second in seconds)
+
+
+def test_results_do_not_depend_on_the_clock(set_clock, account):
     """The clock of the computer is set back and forth; time limits and results are the same."""
     expected = compare(generation(), PriorDraws(), **SMALL)
-    jumps = itertools.accumulate(itertools.cycle([3e6, -7e6]))
-    now = time.time
-    monkeypatch.setattr(time, "time", lambda: now() + next(jumps))
+    set_clock()
     with account("clock", "grid"):
         jumping = compare(generation(), PriorDraws(), time_limit=600.0, **SMALL)
         assert numbers(jumping.table()) == numbers(expected.table())
@@ -85,8 +174,6 @@ def test_two_runs_in_one_folder(name, tmp_path, account):
 
 
 def test_a_locked_folder_is_refused_by_training(tmp_path, account):
-    from probmotion.cli.main import main
-
     walk = ["--steps", "1", "--frames", "12", "--views", "1", "--size", "tiny"]
     with account("two runs", "training"), locked_folder("out", tmp_path):
         assert main(["train", "diffusion", *walk, "--out", str(tmp_path)]) == 2

@@ -12,6 +12,7 @@ from zlib import crc32
 import numpy as np
 import pytest
 import xarray as xr
+from made_reports import WALK
 from own_files import OWN, write_checkpoint
 from safetensors import safe_open
 from safetensors.torch import save_file
@@ -25,10 +26,13 @@ from probmotion.comparison.results.run_results import read_result
 from probmotion.comparison.run.grid_tasks import PilotResult
 from probmotion.files import read_arrays, read_json, write_json
 from probmotion.io.errors import MotionFileError
+from probmotion.models.images.category import Category
 from probmotion.models.mixture import SpectralMixtureMotion
 from probmotion.models.training.checkpoints import load_checkpoint
 from probmotion.posteriors import streams
 from probmotion.posteriors.draws import MotionDraws
+from probmotion.problems.references import chains
+from probmotion.problems.references.chains import StoredChain
 
 RUN = "runs/generation/prior-draws/0"
 
@@ -81,6 +85,16 @@ def read_checkpoint(folder):
     return {name: tensor.numpy() for name, tensor in stored.tensors.items()}, stored.settings
 
 
+def write_chain(folder):
+    state = {"draws": np.ones((2, 3)), "random": np.array(["a", "b"])}
+    StoredChain(folder / "chain.npz").save(lambda: state)
+
+
+def read_motion(folder):
+    motion = pm.load(folder / "walk.npz")
+    return vars(motion) | {"skeleton": vars(motion.skeleton)}
+
+
 def read_reference(folder):
     stored = OWN["reference"][1](folder)
     known = {name: stored.certificate[name] for name in ("draws", "rhat", "seed", "fingerprint")}
@@ -94,6 +108,8 @@ KINDS = {
     "draws": (OWN["draws"][0], read_draws),
     "checkpoint": (write_checkpoint, read_checkpoint),
     "reference": (OWN["reference"][0], read_reference),
+    "chain": (write_chain, OWN["chain"][1]),
+    "motion": (lambda folder: pm.save(WALK, folder / "walk.npz"), read_motion),
     "decomposition": (OWN["decomposition"][0], lambda f: OWN["decomposition"][1](f)._values),
     **{
         name: OWN[name]
@@ -106,11 +122,12 @@ KINDS = {
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch):
     monkeypatch.setattr(streams, "_BLOCK_BYTES", 80_000)
+    monkeypatch.setattr(chains, "_SECONDS", 0.0)
 
 
 FAULTS = [(name, fault) for name in KINDS for fault in ("flipped bit", "cut file", "missing file")]
 # Without a file, nothing is stored yet.
-for name in ("decomposition", "stored problem"):
+for name in ("chain", "decomposition", "stored problem"):
     FAULTS.remove((name, "missing file"))
 
 
@@ -149,50 +166,121 @@ def test_damaged_files_are_not_believed(name, fault, tmp_path, account, moments)
         path.write_bytes(content)
 
 
-def raise_version(folder, name):
-    """Raise the version number of a file."""
-    match name:
-        case "draws":
-            with xr.open_dataset(folder / "draws.nc", engine="scipy") as opened:
-                dataset = opened.load().assign_attrs(format_version=2)
-            del dataset.attrs["checksum"]
-            dataset.to_netcdf(folder / "draws.nc", engine="scipy")
-            MotionDraws.load(folder / "draws.nc")
-        case "checkpoint":
-            path = folder / "model.safetensors"
-            with safe_open(path, framework="pt") as file:
-                header = json.loads(file.metadata()["probmotion"]) | {"format": 2}
-                tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-            save_file(tensors, path, metadata={"probmotion": json.dumps(header)})
-            load_checkpoint(path, "toy")
-        case "grid":
-            write_json(
-                folder / "comparison.json", read_json(folder / "comparison.json") | {"format": 4}
-            )
-            Comparison.load(folder)
-        case "spectral prior":
-            with np.load(folder / "prior.npz") as archive:
-                arrays = dict(archive)
-            arrays["header"] = np.array(
-                json.dumps(json.loads(str(arrays["header"])) | {"format": 2})
-            )
-            np.savez(folder / "prior.npz", **arrays)
-            SpectralMixtureMotion.load(folder / "prior.npz")
+def edit_archive(name, change):
+    """Return a function that changes the arrays of an archive."""
+
+    def edit(folder, number):
+        arrays = read_arrays(folder / name)
+        change(arrays, number)
+        np.savez(folder / name, **arrays)
+
+    return edit
 
 
-WRITERS = {
-    "draws": OWN["draws"][0],
-    "checkpoint": write_checkpoint,
-    "grid": write_grid,
-    "spectral prior": lambda folder: SpectralMixtureMotion.load().save(folder / "prior.npz"),
+def set_format(content, number):
+    """Set or, if it is None, remove the format."""
+    if number is None:
+        del content["format"]
+    else:
+        content["format"] = np.array(number)
+
+
+def set_header(key):
+    """Return a function that sets the format in the header of an archive."""
+
+    def change(arrays, number):
+        arrays[key] = np.array(json.dumps(json.loads(str(arrays[key])) | {"format": number}))
+
+    return change
+
+
+def edit_json(name):
+    def edit(folder, number):
+        content = read_json(folder / name)
+        del content["format"]
+        write_json(folder / name, content | ({} if number is None else {"format": number}))
+
+    return edit
+
+
+def edit_draws(name):
+    def edit(folder, number):
+        with xr.open_dataset(folder / name, engine="scipy") as opened:
+            dataset = opened.load().assign_attrs(format_version=number)
+        del dataset.attrs["checksum"]
+        dataset.to_netcdf(folder / name, engine="scipy")
+
+    return edit
+
+
+def edit_zarr(folder, number):
+    for path in (folder / "draws.zarr").rglob(".z[ag]r*"):
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"zarr_format": number}))
+
+
+def edit_checkpoint(folder, number):
+    path = folder / "model.safetensors"
+    with safe_open(path, framework="pt") as file:
+        header = json.loads(file.metadata()["probmotion"]) | {"format": number}
+        tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    save_file(tensors, path, metadata={"probmotion": json.dumps(header)})
+
+
+# The format of files without a number is 1.
+UNNUMBERED = {
+    "annotations": edit_archive("a.npz", set_format),
+    "annotation prior": edit_archive("p.npz", set_format),
+    "joint limits": edit_archive("l.npz", set_format),
+    "chain": edit_archive("chain.npz", set_format),
+    "stored problem": edit_archive("problem.npz", set_format),
+    "decomposition": edit_json("decompose_error.json"),
+}
+# Runs and pilots are read by the plan of their grid.
+NUMBERED = UNNUMBERED | {
+    "draws": edit_draws("draws.nc"),
+    "stream": edit_draws("last.nc"),
+    "arrays of a stream": edit_zarr,
+    "checkpoint": edit_checkpoint,
+    "grid": edit_json("comparison.json"),
+    "pose depth": edit_archive("d.npz", set_header("header")),
+    "category": edit_archive("c.npz", set_header("settings")),
+    "spectral prior": edit_archive("prior.npz", set_header("header")),
+}
+VERSIONED = KINDS | {
+    "grid": (write_grid, Comparison.load),
+    "category": (
+        lambda folder: Category.load("quadruped").save(folder / "c.npz"),
+        lambda folder: Category.load(folder / "c.npz"),
+    ),
+    "arrays of a stream": KINDS["stream"],
+    "spectral prior": (
+        lambda folder: SpectralMixtureMotion.load().save(folder / "prior.npz"),
+        lambda folder: SpectralMixtureMotion.load(folder / "prior.npz"),
+    ),
 }
 
 
-@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("name", NUMBERED)
 def test_files_of_a_later_version_are_refused(name, tmp_path, account):
-    WRITERS[name](tmp_path)
-    with account("later version", name), pytest.raises(ValueError, match=r"version|format"):
-        raise_version(tmp_path, name)
+    write, read = VERSIONED[name]
+    write(tmp_path)
+    NUMBERED[name](tmp_path, 99)
+    with account("later version", name):
+        with pytest.raises(ValueError) as caught:  # noqa: PT011 (its message is checked below)
+            read(tmp_path)
+        message = str(caught.value).replace(str(tmp_path), "")
+        assert "version" in message or "format" in message
+
+
+@pytest.mark.parametrize("name", UNNUMBERED)
+def test_files_without_a_format_are_read(name, tmp_path, account):
+    """As written before there were formats."""
+    write, read = KINDS[name]
+    write(tmp_path)
+    expected = fingerprint(read(tmp_path))
+    UNNUMBERED[name](tmp_path, None)
+    with account("no version", name):
+        assert fingerprint(read(tmp_path)) == expected
 
 
 def test_files_without_a_checksum_are_read(tmp_path):
@@ -239,7 +327,10 @@ def test_archives_of_other_tools_are_read(tmp_path):
     assert list(read_arrays(path)) == ["first"]
 
 
-@pytest.mark.parametrize(("name", "value"), [("n", 10**400), ("classifier", [0.5, 0.0])])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("n", 10**400), ("classifier", [0.5, 0.0]), ("spread", [[1.0, 1.0], [1.0, 1.0]])],
+)
 def test_impossible_statistics_are_not_believed(name, value, tmp_path):
     OWN["comparison"][0](tmp_path)
     path = tmp_path / "runs/filmed/good/0/run.json"
@@ -247,4 +338,13 @@ def test_impossible_statistics_are_not_believed(name, value, tmp_path):
     stored = read_json(path)
     stored["statistics"][name] = value
     write_json(path, stored)
+    assert read_result(path.parent) is None
+
+
+@pytest.mark.parametrize("entry", ["problem", "sampler", "seed"])
+def test_results_of_other_runs_are_not_believed(entry, tmp_path):
+    OWN["comparison"][0](tmp_path)
+    path = tmp_path / "runs/filmed/good/0/run.json"
+    stored = read_json(path)
+    write_json(path, stored | {entry: 7 if entry == "seed" else "other"})
     assert read_result(path.parent) is None

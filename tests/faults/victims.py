@@ -15,6 +15,7 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing import forkserver
 from pathlib import Path
 from unittest.mock import patch
@@ -26,8 +27,10 @@ from toy_samplers import numbers
 import probmotion as pm
 from probmotion.cli.main import main
 from probmotion.comparison.results.run_results import read_draws, read_result
+from probmotion.models.images.category import Category
 from probmotion.models.training.checkpoints import _kind, load_checkpoint
 from probmotion.posteriors import streams
+from probmotion.reconstruction import learning, refinement
 
 # Imported when they are used, which takes longer than the work of a victim.
 for module in (
@@ -35,10 +38,12 @@ for module in (
     "probmotion.samplers.mcmc.metropolis",
     "torch._dynamo", "probmotion.cli.train", "probmotion.metrics.measures",
     "probmotion.data.projections", "probmotion.models.diffusion.training",
+    "probmotion.models.images.encoder_training", "probmotion.models.images.made_images",
     "probmotion.models.vae.training", "probmotion.models.dvae.denoiser_training",
 ):  # fmt: skip
     importlib.import_module(module)
 
+learn_surface = learning.learn_surface
 PARTS = ["--validation", "walk3", "--test", "walk4"]
 
 
@@ -133,6 +138,24 @@ def weights(folder):
     return stored
 
 
+def images(folder, data):
+    """Train the first encoder, two rounds of few steps, and the encoder of the new category."""
+    refinement._STAGES = ((32, 4.0, 1),)
+    learning.learn_surface = partial(learn_surface, steps=2)
+    words = "--images 2 --steps 6 --batch 2 --checkpoint-every 2"
+    start = str(data / "animal.npz")
+    return main(["train", "images", "--category", start, *words.split(), "--out", str(folder)])
+
+
+def rounds(folder):
+    return taken_steps(folder) | {"rounds": learning.rounds_done(folder)}
+
+
+def category_and_weights(folder):
+    category = Category.load(folder / learning.CATEGORY)
+    return weights(folder) | {"category": category.digest, "rounds": category.card["rounds"]}
+
+
 TRACKS = ("--views", "2")
 VICTIMS = {
     "grid": grid(workers=0),
@@ -144,6 +167,7 @@ VICTIMS = {
     "train motion-vae": training("motion-vae", 12, *TRACKS),
     "train dvae": training("dvae", 16, "--batch", "4"),
     "train denoiser": training("denoiser", 16, "--batch", "4", "--prior", "DATA/dvae"),
+    "train images": Victim(images, rounds, category_and_weights),
 }
 FAST = ("streamed chain", "train diffusion")
 

@@ -93,6 +93,11 @@ def test_a_fault_is_named(monocular, fault, word):
     assert found[word] >= 0.9 * REPEATS, found
 
 
+def test_equal_draws_are_overconfident(monocular):
+    motions = np.ones_like(exact_sets(monocular, repeats=1)[0])  # no variance, not even of rounding
+    assert verdict_of(monocular, motions, independent=True).word in ("biased", "overconfident")
+
+
 def test_a_missing_mode_is_named(gait):
     prior = gait.posterior.prior
     lost = []

@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Self
 
 from probmotion.comparison.results.plan import Plan
 from probmotion.comparison.results.run_results import (
+    RESULT,
     RunResult,
     read_draws,
     read_result,
     used_of_budget,
 )
 from probmotion.comparison.results.summary import summary, verdict_text
-from probmotion.files import written_whole
+from probmotion.files import writable_folder, written_whole
 from probmotion.metrics.run_statistics import DrawStatistics
 from probmotion.metrics.verdict import Verdict, judge
 from probmotion.posteriors.draws import MotionDraws
@@ -201,8 +202,7 @@ class GridResults:
 
         Runs are copied if ``folder`` is another one.
         """
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
+        folder = writable_folder(Path(folder), "folder")
         if folder.resolve() != self.folder.resolve():
             copied = [
                 self.plan.run_folder(Path(), result.problem, result.sampler, result.seed)
@@ -212,8 +212,7 @@ class GridResults:
                 Path(kind) / name for kind in ("problems", "pilots") for name in self.plan.problems
             ]
             for part in copied:
-                if (self.folder / part).exists():
-                    shutil.copytree(self.folder / part, folder / part, dirs_exist_ok=True)
+                _copy(self.folder / part, folder / part)
             self.plan.save(folder)
         table = self.table()
         with written_whole(folder / _TABLE) as unfinished:
@@ -231,3 +230,13 @@ class GridResults:
 
     def __repr__(self) -> str:
         return self.summary()
+
+
+def _copy(source: Path, target: Path) -> None:
+    """Copy the files of a folder that may not exist, each atomically, and ``run.json`` last."""
+    for path in sorted(source.rglob("[!.]*"), key=lambda path: path.name == RESULT):
+        if path.is_file():
+            copy = target / path.relative_to(source)
+            writable_folder(copy.parent, "folder")
+            with written_whole(copy) as unfinished:
+                shutil.copyfile(path, unfinished)

@@ -66,6 +66,8 @@ def read_result(folder: Path) -> RunResult | None:
             **stored, metrics=metrics, failure=None if failure is None else read_failure(failure)
         )
         check_types(result)
+        if folder.parts[-3:] != (result.problem, result.sampler, str(result.seed)):
+            raise ValueError(f"{RESULT} must be in the folder of its run, got {folder}")
         if result.budget is not None:
             _check_budget(result.budget)
         if result.statistics is not None:
@@ -103,6 +105,7 @@ def _check_statistics(stored: DrawStatistics) -> None:
         # NaN is stored as null.
         if np.array(value, dtype=np.float64).shape not in shapes:
             raise ValueError(f"{name} must have shape {shapes[0]}, got {value!r:.80}")
+    np.linalg.inv(stored.spread)  # singular ones raise
     if not stored.n > 0:
         raise ValueError(f"n must be above 0, got {stored.n!r:.80}")
     if stored.classifier and stored.classifier[1] == 0:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from probmotion.files import read_arrays, written_whole
+from probmotion.files import check_format, read_arrays, written_whole
 from probmotion.geometry.cameras import Cameras
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.likelihoods import Joints3D, Keypoints2D
@@ -97,6 +97,7 @@ def store_problem(problem: Problem, folder: str | Path, draws: int = 8, seed: in
     """
     stored = StoredProblem.of(problem, draws, seed)
     arrays: dict[str, np.ndarray] = {
+        "format": np.array(1),
         "joint_names": np.array(stored.skeleton.joint_names),
         "parents": np.array(stored.skeleton.parents),
         "fps": np.array(stored.fps),
@@ -126,6 +127,7 @@ def read_stored(folder: str | Path) -> StoredProblem | None:
         return None
     try:
         arrays = read_arrays(path)
+        check_format(arrays)
         camera = None
         if "camera_rotation" in arrays:
             numbers: dict[str, Any] = {name: arrays[f"camera_{name}"] for name in _CAMERA}

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from probmotion.files import read_arrays, written_whole
+from probmotion.files import check_format, read_arrays, written_whole
 from probmotion.interaction.annotations.local_frames import chest_joints, joint_roots
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_positive, check_shape
@@ -190,6 +190,7 @@ class Annotations:
     def save(self, path: str | Path) -> None:
         """Write the annotations to an ``.npz`` archive, atomically."""
         arrays: dict[str, np.ndarray] = {
+            "format": np.array(1),
             "keypoints": self.keypoints,
             "visible": self.visible,
             "neighbours": self.neighbours,
@@ -213,6 +214,7 @@ class Annotations:
         """Read an archive written by :meth:`save`; raise ``ValueError`` if it is damaged."""
         try:
             arrays = read_arrays(path)
+            check_format(arrays)
             skeleton = Skeleton(
                 arrays["joint_names"].tolist(),
                 arrays["parents"].tolist(),

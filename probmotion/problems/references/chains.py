@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from probmotion.files import read_arrays, written_whole
+from probmotion.files import check_format, read_arrays, written_whole
 
 __all__ = ["StoredChain"]
 
@@ -30,12 +30,14 @@ class StoredChain:
         if self.path is None or not self.path.is_file():
             return None
         try:
-            return read_arrays(self.path)
+            state = read_arrays(self.path)
+            check_format(state)
         except (ValueError, OSError) as error:
             raise ValueError(
                 f"{self.path} must contain a stored chain, got {str(error)[:200]}; "
                 "delete it to restart"
             ) from error
+        return state
 
     def save(self, state: Callable[[], Mapping[str, np.ndarray]]) -> None:
         """Write the state if 30 s have passed since the last checkpoint; warn if writing fails."""
@@ -43,7 +45,7 @@ class StoredChain:
             return
         try:
             with written_whole(self.path) as unfinished:
-                np.savez(unfinished, allow_pickle=False, **state())
+                np.savez(unfinished, allow_pickle=False, format=np.array(1), **state())
         except OSError as error:
             warnings.warn(f"checkpoint was not written: {error}; sampling continues", stacklevel=2)
         self._written = time.monotonic()
