@@ -61,8 +61,8 @@ def check_finite(name: str, value: Any) -> None:
 def check_positive(name: str, value: float) -> None:
     """Raise ``ValueError`` unless ``value`` is a finite number above zero."""
     number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    if not (number and np.isfinite(value) and value > 0):
-        raise ValueError(f"{name} must be a finite number above 0, got {value!r}")
+    if not (number and 0 < value <= np.finfo(float).max):
+        raise ValueError(f"{name} must be a finite number above 0, got {value!r:.80}")
 
 
 def check_count(name: str, value: int, least: int = 1) -> None:

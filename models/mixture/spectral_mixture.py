@@ -47,6 +47,7 @@ __all__ = ["SpectralMixtureMotion"]
 _MAX_VIEWS = 16  # views whose decompositions are kept
 _WEIGHTS = Path(__file__).parents[1] / "weights"  # priors shipped with the package
 _FORMAT = 1  # version of the format
+_ROUNDING = 1e-3  # error of products of rounded directions
 _ROUNDED = ("poses", "velocities", "directions", "variances")
 _EXACT = ("band", "weights", "scales", "scale_weights")
 
@@ -439,20 +440,25 @@ class SpectralMixtureMotion:
         try:
             archive = read_arrays(path)
             header = json.loads(str(archive["header"]))
-            arrays: dict[str, Any] = {name: archive[name] for name in (*_ROUNDED, *_EXACT)}
-            arrays |= {name: arrays[name].astype(np.float64) for name in _ROUNDED}
             if header["format"] != _FORMAT:
                 raise ValueError(f"format {header['format']}")
-            skeleton = Skeleton(**header["skeleton"])
+            arrays: dict[str, Any] = {name: archive[name] for name in (*_ROUNDED, *_EXACT)}
+            for name, array in arrays.items():
+                if array.dtype.kind != ("i" if name == "band" else "f"):
+                    raise ValueError(f"{name} has the type {array.dtype}")
+            arrays |= {name: arrays[name].astype(np.float64) for name in _ROUNDED}
+            # Rounding to single precision must not cost orthonormality.
+            arrays["directions"] = _orthonormal(arrays["directions"])
             numbers = {name: header[name] for name in ("fps", "ground", "azimuths", "card")}
-        except (KeyError, TypeError, ValueError, OSError, RecursionError) as error:
+            prior = cls(Skeleton(**header["skeleton"]), **numbers, **arrays)
+            with np.errstate(over="ignore", invalid="ignore"):
+                check_positive("scale", prior.scale)
+        except (ArithmeticError, LookupError, OSError, TypeError, ValueError, RecursionError) as e:
             raise ValueError(
                 f"source must be a file written by SpectralMixtureMotion.save, got {path.name} "
-                f"({error})"
-            ) from error
-        # Rounding to single precision must not cost orthonormality.
-        arrays["directions"] = _orthonormal(arrays["directions"])
-        return cls(skeleton, **numbers, **arrays)
+                f"({str(e)[:200]})"
+            ) from e
+        return prior
 
     def _noise(self, alpha_bar: float) -> tuple[float, float]:
         """Return s/√ᾱ and the variance of X_t s/√ᾱ around X₀, square metres; s is the scale."""
@@ -487,6 +493,11 @@ class SpectralMixtureMotion:
 
 def _orthonormal(directions: np.ndarray) -> np.ndarray:
     """Return the nearest orthonormal columns; the translations stay exact: (K, B, P, P)."""
+    # The decomposition of infinite numbers does not end.
+    check_finite("directions", directions)
+    gram = directions.swapaxes(-1, -2) @ directions
+    if abs(gram - np.eye(directions.shape[-1])).max() > _ROUNDING:
+        raise ValueError("directions must have orthonormal columns")
     left, _, right = np.linalg.svd(directions)
     out = left @ right
     fixed = translations(directions.shape[2] // 3)

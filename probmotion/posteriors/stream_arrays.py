@@ -2,22 +2,33 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
+from xarray.backends import BackendArray
+from xarray.core import indexing
 
 from probmotion.posteriors.draws import MotionDraws
 
-__all__ = ["AXES", "CHUNKS", "check_stored", "write_block"]
+__all__ = ["AXES", "CHUNKS", "damaged", "stored_variable", "write_block"]
 
 AXES = ("chain", "draw")
 """First dimensions of variables with a value per draw."""
 
 CHUNKS = 16
 """Number of chunks per block, so that short runs have small files."""
+
+_CHECKSUM_BYTES = 4
+_LAYOUT = {
+    "order": "C",
+    "filters": None,
+    "compressor": {"id": "crc32c"},
+    "dimension_separator": ".",
+}
 
 
 def write_block(folder: Path, new: MotionDraws, done: int, total: int, block: int) -> None:
@@ -68,8 +79,11 @@ def _is_plain(array: Any, values: np.ndarray) -> bool:
     """Return whether a chunk is a file with the numbers of all chains and their CRC32C."""
     layout = array.metadata.to_dict()
     chunks = (len(values), array.chunks[1], *values.shape[2:])
-    expected = {"chunks": chunks, "order": "C", "filters": None, "compressor": {"id": "crc32c"}}
-    return array.dtype == values.dtype and all(layout[key] == expected[key] for key in expected)
+    return (
+        array.dtype == values.dtype
+        and array.chunks == chunks
+        and all(layout[key] == expected for key, expected in _LAYOUT.items())
+    )
 
 
 def _write_chunk(path: Path, values: np.ndarray) -> None:
@@ -92,17 +106,67 @@ def _chunk(folder: Path, number: int, dims: int) -> Path:
     return folder / f"0.{number}{'.0' * (dims - 2)}"
 
 
-def check_stored(folder: Path, stored: xr.DataArray | None, last: xr.DataArray, draws: int) -> None:
-    """Raise ``ValueError`` unless a variable has all its draws; those missing are read as zeros."""
+def stored_variable(group: Any, folder: Path, last: xr.DataArray, draws: int) -> xr.Variable:
+    """Return the first draws of a variable, to be read when they are used.
+
+    ``group`` is the Zarr group that has the array in ``folder``, ``last`` the last draw.
+
+    Raises
+    ------
+    ValueError
+        If not all draws are stored; those missing would be read as zeros.
+    """
+    try:
+        array = group[folder.name]
+        layout = array.metadata.to_dict()
+        length = array.chunks[1]
+    except Exception as error:  # of damaged files, of many types
+        raise damaged(folder, error) from error
+    shape = (last.shape[0], array.shape[1], *last.shape[2:])
+    chunks = (shape[0], length, *shape[2:])
+    # In netCDF, integers have other sizes.
+    integers = array.dtype.kind in "iu" and last.dtype.kind in "iu"
     if (
-        stored is None
-        or stored.dims != last.dims
-        or stored.isel(draw=slice(1)).shape != last.shape
-        or stored.sizes["draw"] < draws
-        or not stored.dtype.isnative
+        array.shape != shape
+        or array.chunks != chunks
+        or length < 1
+        or array.shape[1] < draws
+        or not array.dtype.isnative
+        or not (integers or array.dtype.kind == last.dtype.kind)
+        or any(layout[key] != expected for key, expected in _LAYOUT.items())
     ):
-        raise ValueError(f"{folder} is damaged: it must have {draws} draws of {last.sizes}")
-    for number in range(-(-draws // stored.encoding["chunks"][1])):
-        chunk = _chunk(folder, number, stored.ndim)
-        if not chunk.exists():
-            raise ValueError(f"{folder} is damaged: the draws in {chunk.name} are missing")
+        raise damaged(folder, f"it must have {draws} draws of {dict(last.sizes)}")
+    size = math.prod(chunks) * array.dtype.itemsize + _CHECKSUM_BYTES
+    for number in range(-(-draws // length)):
+        chunk = _chunk(folder, number, last.ndim)
+        if not chunk.is_file():
+            raise damaged(folder, f"the draws in {chunk.name} are missing")
+        if chunk.stat().st_size != size:
+            raise damaged(chunk, f"it must have {size} bytes, got {chunk.stat().st_size}")
+    lazy = indexing.LazilyIndexedArray(_StoredArray(folder, array))
+    return xr.Variable(last.dims, indexing.MemoryCachedArray(lazy))[:, :draws]
+
+
+def damaged(path: Path, reason: object) -> ValueError:
+    """Return the error of a damaged file or folder of a stream."""
+    return ValueError(
+        f"{path} is damaged: {str(reason)[:200]}; restore it or stream to another folder"
+    )
+
+
+class _StoredArray(BackendArray):
+    """Zarr array whose damaged chunks raise ``ValueError`` when they are read."""
+
+    def __init__(self, folder: Path, array: Any) -> None:
+        self.folder, self.zarr = folder, array
+        self.shape, self.dtype = array.shape, array.dtype
+
+    def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
+        outer = indexing.IndexingSupport.OUTER
+        return indexing.explicit_indexing_adapter(key, self.shape, outer, self._read)
+
+    def _read(self, key: tuple[Any, ...]) -> Any:
+        try:
+            return self.zarr.oindex[key]
+        except Exception as error:  # of damaged chunks, of many types
+            raise damaged(self.folder, error) from error

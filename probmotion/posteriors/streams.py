@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 
 from probmotion.arrays import to_numpy
 from probmotion.files import (
@@ -27,7 +26,7 @@ from probmotion.files import (
 from probmotion.posteriors.draws import MotionDraws, check_same_run
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.sampling import Interrupted, Sampler, progress_bar
-from probmotion.posteriors.stream_arrays import AXES, CHUNKS, check_stored, write_block
+from probmotion.posteriors.stream_arrays import AXES, CHUNKS, damaged, stored_variable, write_block
 from probmotion.validation import check_count
 
 __all__ = ["open_draws", "stream_draws"]
@@ -153,12 +152,18 @@ def _not_a_run(path: str | Path) -> ValueError:
 
 def _last_of(folder: Path) -> MotionDraws | None:
     file = folder / _LAST
-    return MotionDraws.load(file) if file.exists() else None
+    if not file.exists():
+        return None
+    last = MotionDraws.load(file)
+    numbers = last.dataset["draw"].values
+    if numbers.shape != (1,) or numbers.dtype.kind not in "iu" or numbers[0] < 0:
+        raise damaged(file, f"it must have the number of the last draw, got {numbers}")
+    return last
 
 
 def _number(last: MotionDraws | None) -> int:
     """Return the number of complete draws per chain."""
-    return 0 if last is None else int(last.dataset["draw"].values[-1]) + 1
+    return 0 if last is None else int(last.dataset["draw"].values[0]) + 1
 
 
 def _block(posterior: MotionPosterior, chains: int) -> int:
@@ -216,21 +221,17 @@ def _complete(folder: Path, new: MotionDraws, last: MotionDraws | None, done: in
 
 def _opened(folder: Path, last: MotionDraws, draws: int) -> MotionDraws:
     """Return the first draws of a store, without reading them."""
-    from probmotion.extras import zarr  # noqa: F401 (xarray imports it, but names no extra)
+    from probmotion.extras import zarr
 
     store = folder / _DRAWS
     try:
-        dataset = xr.open_zarr(
-            store, consolidated=False, chunks=None, zarr_format=2, mask_and_scale=False
-        )
+        group = zarr.open_group(store, mode="r", zarr_format=2)
     except Exception as error:  # of damaged files, of many types
-        raise ValueError(f"{store} is damaged: {str(error)[:200]}") from error
-    for name, variable in last.dataset.data_vars.items():
-        if variable.dims[:2] == AXES:
-            check_stored(store / str(name), dataset.get(name), variable, draws)
-    rest = last.dataset.drop_dims("draw")
-    opened = dataset.isel(draw=slice(draws)).assign(rest.data_vars)
-    shared = ("chain", "frame", "joint", "axis")
-    coordinates: dict[str, Any] = {name: last.dataset[name] for name in shared}
-    coordinates["draw"] = np.arange(draws)
-    return MotionDraws(opened.assign_coords(coordinates).assign_attrs(last.dataset.attrs))
+        raise damaged(store, error) from error
+    dataset = last.dataset.drop_dims("draw").assign_coords(draw=np.arange(draws))
+    variables = {
+        name: stored_variable(group, store / str(name), variable, draws)
+        for name, variable in last.dataset.data_vars.items()
+        if variable.dims[:2] == AXES
+    }
+    return MotionDraws(dataset.assign(variables))

@@ -155,11 +155,7 @@ def test_damaged_files_are_not_believed(name, fault, tmp_path, account, moments)
                     path.unlink()
             try:
                 result = fingerprint(read(tmp_path))
-            except (
-                ValueError,
-                OSError,
-                RuntimeError,
-            ):  # RuntimeError: by Zarr, when draws are read
+            except (ValueError, OSError):
                 pass
             else:  # a byte that nobody reads
                 assert result == expected, (path, place)

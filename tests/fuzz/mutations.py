@@ -22,7 +22,7 @@ VALUES = [
 
 def mutated(rng, name, content):
     """Return the content of a file after one to four mutations."""
-    if name.endswith(".json") and rng.random() < 0.5:
+    if name.endswith((".json", ".zarray", ".zattrs", ".zgroup")) and rng.random() < 0.5:
         return json.dumps(_of_json(rng, json.loads(content))).encode()
     if name.endswith(".npz") and rng.random() < 0.5:
         return _of_archive(rng, content)

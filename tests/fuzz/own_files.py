@@ -2,11 +2,12 @@
 
 import json
 from functools import partial
+from unittest import mock
 
 import numpy as np
 from made_reports import WALK, filmed_problem, walk_prior
 
-from probmotion import MotionDraws, MotionPosterior
+from probmotion import MotionDraws, MotionPosterior, open_draws
 from probmotion.calibration.error_result import StoredValues
 from probmotion.comparison.grid import Comparison
 from probmotion.comparison.results.failures import Failure
@@ -14,14 +15,19 @@ from probmotion.comparison.results.plan import Plan
 from probmotion.comparison.results.run_results import RunResult
 from probmotion.comparison.results.stored_problems import read_stored, store_problem
 from probmotion.comparison.run.grid_tasks import Pilot
+from probmotion.files import LOCK
 from probmotion.interaction.annotations.annotations import Annotations
+from probmotion.models.mixture.spectral_mixture import SpectralMixtureMotion
+from probmotion.models.mixture.spectrum import principal_directions
 from probmotion.models.pose_pairs.joint_limits import JointLimits
 from probmotion.models.training.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from probmotion.models.unseen_depth.annotation_prior import AnnotationPrior
 from probmotion.models.unseen_depth.pose_depth import PoseDepth
 from probmotion.motion.skeleton import Skeleton
+from probmotion.posteriors import streams
 from probmotion.posteriors.reference import StoredReference
 from probmotion.problems.references.chains import StoredChain
+from probmotion.samplers.mcmc.metropolis import MetropolisHastings
 
 LEG = Skeleton(["hip", "knee"], [-1, 0])
 FINGERPRINT = "0" * 16
@@ -35,6 +41,10 @@ STATISTICS = {
 
 class Named:
     name = "made"
+
+
+STREAMED = {}
+"""Draws that :func:`write_stream` wrote."""
 
 
 def small_draws():
@@ -96,6 +106,22 @@ def write_prior(folder):
     means -= means.mean(axis=1, keepdims=True)
     views = np.array([[0.1, 0.2], [1.0, 0.0]])
     AnnotationPrior(np.array([0.4, 0.6]), means, covariances, 0.03, views).save(folder / "p.npz")
+
+
+def write_spectra(folder):
+    poses = np.random.default_rng(0).normal(size=(2, 2, 3))
+    band = np.array([0, 1, 2])
+    directions, variances = principal_directions(np.stack([0.1 * np.eye(6)] * 3), band)
+    SpectralMixtureMotion(
+        LEG, 30.0, poses - poses.mean(axis=1, keepdims=True), np.zeros((2, 2)),
+        np.stack([directions] * 2), band, np.stack([variances] * 2), np.array([0.4, 0.6]),
+        azimuths=2, card={"command": "x"},
+    ).save(folder / "s.npz")  # fmt: skip
+
+
+def read_spectra(folder):
+    prior = SpectralMixtureMotion.load(folder / "s.npz")
+    assert np.isfinite(prior.motion(np.ones((1, prior.dim)))).all()
 
 
 def write_depths(folder):
@@ -168,6 +194,28 @@ def write_pilot(folder):
     (folder / "pilot.json").write_text(json.dumps(stored))
 
 
+def streamed(folder):
+    """Write three draws of two chains to a stream with small chunks, or continue it."""
+    sampler, posterior = MetropolisHastings(warmup=3, thin=1), MotionPosterior(walk_prior())
+    with mock.patch.object(streams, "_BLOCK_BYTES", 1):
+        return streams.stream_draws(sampler, posterior, folder, draws=3, chains=2, progress=False)
+
+
+def read_stream(folder):
+    """Open draws and continue their run, which is finished; other draws must not be read."""
+    for draws in (open_draws(folder), streamed(folder)):
+        for name, expected in STREAMED.items():
+            values = draws.dataset[name].values
+            np.testing.assert_array_equal(values, expected[:, : values.shape[1]])
+
+
+def write_stream(folder):
+    STREAMED.update(
+        {name: streamed(folder).dataset[name].values for name in ("positions", "theta")}
+    )
+    (folder / LOCK).unlink()
+
+
 def write_stored(folder):
     store_problem(filmed_problem(3), folder, draws=2)
 
@@ -212,6 +260,7 @@ OWN = {
     "reference": (write_reference, lambda folder: StoredReference.load(folder / "toy")),
     "annotations": (write_annotations, lambda folder: Annotations.load(folder / "a.npz")),
     "annotation prior": (write_prior, lambda folder: AnnotationPrior.load(folder / "p.npz")),
+    "spectral prior": (write_spectra, read_spectra),
     "pose depth": (write_depths, lambda folder: PoseDepth.load(folder / "d.npz")),
     "joint limits": (
         lambda folder: JointLimits.shipped().save(folder / "l.npz"),
@@ -224,6 +273,7 @@ OWN = {
     "chain": (write_chain, lambda folder: StoredChain(folder / "chain.npz").load()),
     "decomposition": (write_values, lambda folder: StoredValues(folder, "what")),
     "pilot": (write_pilot, read_pilot),
+    "stream": (write_stream, read_stream),
     "stored problem": (write_stored, read_stored),
 }
 """Functions that write into a folder and read it, by kind."""

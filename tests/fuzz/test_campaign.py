@@ -12,6 +12,8 @@ import warnings
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
+from types import SimpleNamespace
+from unittest import mock
 from zlib import crc32
 
 import motion_files as files
@@ -20,7 +22,7 @@ import pytest
 from mutations import mutated
 from own_files import OWN
 
-from probmotion.cli.main import main
+from probmotion.cli.main import _parse as parse, main
 from probmotion.cli.settings_options import object_from_text
 from probmotion.io.bvh import read_bvh
 from probmotion.io.errors import MotionFileError
@@ -75,16 +77,33 @@ def read_setting(folder):
     assert isinstance(object_from_text(text, [DPS]), DPS)
 
 
-def read_words(folder):
-    """Run a command; it ends with a status."""
-    text = (folder / "words.txt").read_bytes().decode("utf-8", "replace")
-    words = [word.replace("IN", str(folder / "clip.bvh")) for word in text.split()[:12]]
-    words = [word.replace("OUT", str(folder / "out.npz")) for word in words]
+def status_of(words):
+    """Run a command and return its status."""
     try:
-        status = main(["convert", *words])
+        status = main(words)
     except SystemExit as end:
         status = end.code
     assert status in (0, 2)
+    return status
+
+
+def read_words(folder):
+    """Convert a motion."""
+    text = (folder / "words.txt").read_bytes().decode("utf-8", "replace")
+    words = [word.replace("IN", str(folder / "clip.bvh")) for word in text.split()[:12]]
+    return status_of(["convert", *(word.replace("OUT", str(folder / "out.npz")) for word in words)])
+
+
+def parse_words(folder):
+    """Parse a command without running it."""
+    text = (folder / "words.txt").read_bytes().decode("utf-8", "replace")
+
+    def parsed(name, words):
+        parse(name, words)
+        return SimpleNamespace(run=lambda: None)
+
+    with mock.patch("probmotion.cli.main._parse", parsed):
+        return status_of(text.split())
 
 
 def motion_kinds():
@@ -110,12 +129,33 @@ LEG = Skeleton(["hip", "knee"], [-1, 0])
 # Readers that take more than a millisecond get fewer inputs.
 SHARES = {"report": 0.01, "comparison": 0.1, "draws": 0.4, "joint limits": 0.4, "summary": 0.3}
 SHARES |= {"category": 0.1, "images": 0.4}
-SHARES |= {"stored problem": 0.5, "checkpoint": 0.5}
+SHARES |= {"stored problem": 0.5, "checkpoint": 0.5, "stream": 0.1, "spectral prior": 0.5}
 WORDS = {
     "problem": (b"gait-monocular(frames=20, noise=0.05)", read_names, 1.0),
     "setting": (b"DPS(step_size=0.5)", read_setting, 1.0),
     "command": (b"IN OUT --fps 30 --unit cm --up z --mirror", read_words, 0.02),
 }
+COMMANDS = (
+    "lift k.json --out o --image-size 1920 1080 --fps 30 --person 0 --fov 60 --draws 5 --strict",
+    "show clip.bvh --fps 30 --unit cm --image-size 1920 1080 --skeleton coco17 --figure f.png",
+    "compare gait-monocular --samplers mh nuts --draws 4 --seeds 2 --out o --settings.mh.thin 3 "
+    "--settings.mh.warmup 20 --settings.mas.guidance DPS(step_size=2) --evaluations 100 --quick",
+    "denoise a.npz --out o --noise .02 --draws 3 --outliers --unit mm --up z",
+    "reconstruct a.png --mask m.png --category quadruped --out o --fov 40 --draws 3 --seed 1",
+    "train diffusion --out o --size tiny --steps 3 --learning-rate 1e-3 --clips a.npz b.npz",
+    "train evaluator --out o --size small --frames 30 --batch 4 --device cpu --threshold .1",
+    "train lifter --out o --tracks a.json --tracks-fps 30 --layout coco17 --validation a --test b",
+    "train dvae --out o --clips a.npz --validation a --test b --steps 3",
+    "train denoiser --out o --prior o --least .01 --hidden .2 --clips a.npz --data-seed 1",
+    "train motion-vae --out o --tracks a.json --kl .1 --front nose --views 8 --centre sequence",
+    "train images --out o --category quadruped --images 9 --rounds 2 --fov 40 --batch 4",
+)
+WORDS |= {
+    " ".join(line.split()[: 1 + line.startswith("train")]): (
+        line.encode(), parse_words, 0.002 if line.startswith("compare") else 0.02
+    )
+    for line in COMMANDS
+}  # fmt: skip
 
 
 @cache
@@ -201,7 +241,7 @@ def test_undamaged_files_are_read(name, tmp_path, watched, capsys):
     for file, content in kinds()[name].files.items():
         (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / file).write_bytes(content)
-    kinds()[name].read(tmp_path)
+    assert kinds()[name].read(tmp_path) != 2  # the status of a failing command
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -187,7 +187,7 @@ def test_damaged_draws_are_not_believed(posterior, tmp_path):
         content = bytearray(path.read_bytes())
         content[len(content) // 2] ^= 4
         path.write_bytes(content)
-    with pytest.raises(RuntimeError, match="checksum do not match"):
+    with pytest.raises(ValueError, match=r"theta is damaged: .* checksum do not match"):
         pm.open_draws(tmp_path).dataset["theta"].load()
     os.truncate(tmp_path / "last.nc", 200)
     with pytest.raises(ValueError, match="path must be a netCDF file of draws"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from probmotion import Cameras, MotionPosterior
 from probmotion.data.synthetic.walks import synthetic_walks
+from probmotion.files import read_arrays
 from probmotion.models.mixture import SpectralMixtureMotion
 from probmotion.posteriors import protocols
 
@@ -154,6 +156,30 @@ def test_unreadable_files_are_rejected(prior, tmp_path):
         FileNotFoundError, match=r"must be a file or one of .*, got 'no-such-prior'"
     ):
         SpectralMixtureMotion.load("no-such-prior")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("directions", np.inf, "directions must be finite"),  # LAPACK would not end
+        ("directions", 1e30, "directions must have orthonormal columns"),
+        ("poses", 1e200, "scale must be a finite number"),
+        ("band", np.float64(0), "band has the type float64"),
+        ("ground", 1e308, "Numerical result out of range"),
+    ],
+)
+def test_damaged_files_are_rejected(name, value, message, prior, tmp_path):
+    path = tmp_path / "prior.npz"
+    prior.save(path)
+    stored = read_arrays(path)
+    if name in stored:
+        stored[name] = stored[name].astype(np.float64 if value else type(value))
+        stored[name].flat[-1] = value
+    else:
+        stored["header"] = np.array(json.dumps(json.loads(str(stored["header"])) | {name: value}))
+    np.savez(path, **stored)
+    with pytest.raises(ValueError, match=rf"written by .*save, got prior.npz \(.*{message}"):
+        SpectralMixtureMotion.load(path)
 
 
 def test_pickling_drops_cached_posteriors(prior, make_likelihood):
