@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable
 from dataclasses import fields
 from difflib import get_close_matches
@@ -61,7 +62,7 @@ def check_finite(name: str, value: Any) -> None:
 def check_positive(name: str, value: float) -> None:
     """Raise ``ValueError`` unless ``value`` is a finite number above zero."""
     number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    if not (number and 0 < value <= np.finfo(float).max):
+    if not (number and 0 < value <= sys.float_info.max):
         raise ValueError(f"{name} must be a finite number above 0, got {value!r:.80}")
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from probmotion.comparison.results.headline_metrics import headline_metric
 from probmotion.interaction.geometry.coordinates import align_rigidly
+from probmotion.plots.motion_data import choose_draws
 from probmotion.plots.pairs import draw_pairs
 from probmotion.plots.quality import plot_quality_against_cost
 from probmotion.plots.skeletons import draw_skeletons
@@ -27,7 +28,7 @@ __all__ = ["draw_comparison"]
 
 _DRAWS = 4  # draws per sampler
 _POSES = 6  # poses per sampler of problems with held-out poses
-_REFERENCES = 100  # reference draws of the spread
+_SPREAD = 100  # draws per sampler and reference draws of the spread
 _SIDE_VIEW = np.pi / 2 - 0.35
 """Heading of bodies without observations, radians."""
 
@@ -38,9 +39,9 @@ def draw_comparison(
     """Write the figures of a comparison, each as PNG and PDF, and return their paths.
 
     The figures are ``quality_against_cost``, ``skeletons_<problem>`` and, for problems with
-    observations, ``spread_<problem>``. The quality plot is omitted if no headline metric was
-    measured. With observations, motions are viewed at a right angle to the first camera, if any,
-    with the truth in grey.
+    observations, ``spread_<problem>`` of at most 100 draws per sampler. The quality plot is omitted
+    if no headline metric was measured. With observations, motions are viewed at a right angle to
+    the first camera, if any, with the truth in grey.
 
     Parameters
     ----------
@@ -73,7 +74,7 @@ def draw_comparison(
 def _draw_problem(comparison: GridResults, problem: Problem) -> dict[str, Figure]:
     """Return figures of each sampler's draws of a problem below exact or reference draws."""
     draws = {
-        result.sampler: comparison.draws(problem.name, result.sampler).flat()
+        result.sampler: choose_draws(comparison.draws(problem.name, result.sampler).flat(), _SPREAD)
         for result in comparison.results
         if result.problem == problem.name and result.seed == 0 and result.failure is None
     }
@@ -81,7 +82,7 @@ def _draw_problem(comparison: GridResults, problem: Problem) -> dict[str, Figure
         draws = {"exact": draws.pop("exact")} | draws
     elif problem.has_reference:
         label = "reference" if problem.exact_source is None else "exact draws"
-        n = _REFERENCES if problem.stored is None else min(_REFERENCES, problem.stored.n)
+        n = _SPREAD if problem.stored is None else min(_SPREAD, problem.stored.n)
         draws = {label: problem.reference(0, n)} | draws
     if not draws:
         raise ValueError(f"problem must have draws or references, got none for {problem.name!r}")

@@ -54,8 +54,11 @@ class Shown:
 
 
 def choose_draws(motions: np.ndarray, n: int) -> np.ndarray:
-    """Return n evenly spaced draws, because consecutive draws of a chain are correlated."""
-    return motions[:: max(1, len(motions) // n)][:n]
+    """Return n evenly spaced draws, because consecutive draws of a chain are correlated.
+
+    They are a copy, which does not keep the other draws in memory.
+    """
+    return motions[:: max(1, len(motions) // n)][:n].copy()
 
 
 def motion_numbers(shown: Shown) -> dict[str, Any]:

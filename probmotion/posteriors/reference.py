@@ -2,14 +2,18 @@
 
 A reference is a folder with ``draws.npz`` (``positions`` (n, L, J, 3), metres, float32) and
 ``certificate.json``. The certificate contains a fingerprint of the posterior (see
-``fingerprint_of``) that is reproducible across machines, unlike a hash of the prior.
+``fingerprint_of``) that is reproducible across machines, unlike a hash of the prior, and the
+checksum of ``draws.npz``.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import tempfile
+import zlib
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -18,7 +22,7 @@ import numpy as np
 
 from probmotion import seeds
 from probmotion.arrays import Array, to_numpy
-from probmotion.files import read_arrays, read_json, write_errors, write_json
+from probmotion.files import check_format, read_arrays, read_json, write_errors, write_json
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.protocols import HasLogDensity
 from probmotion.posteriors.truncation import TruncatedPosterior
@@ -27,6 +31,8 @@ from probmotion.validation import check_finite, check_shape
 __all__ = ["HasPositionDensity", "StoredReference", "fingerprint_of", "log_density_at"]
 
 _DRAWS, _CERTIFICATE = "draws.npz", "certificate.json"
+_NEW = ".new.npz"  # draws that replace draws.npz once their certificate is written
+_CHECKSUM = "draws_crc32"  # of the file of draws, in the file of the certificate
 _PROBES = 4  # points at which a fingerprint is evaluated
 _TOLERANCE = 1e-5  # relative tolerance of fingerprints
 _NEEDED = ("problem", "draws", "exact", "sampler", "settings", "agreement", "seed", "fingerprint")
@@ -105,24 +111,27 @@ class StoredReference:
             )
 
     def save(self, folder: str | Path) -> Path:
-        """Write both files into ``folder``; if writing fails, an earlier reference is preserved."""
+        """Write both files into ``folder``, which has the earlier or the new reference at any time.
+
+        The new certificate replaces the earlier one, and with it the draws: those with its
+        checksum.
+        """
         folder = Path(folder)
         json.dumps(self.certificate, allow_nan=False)  # raises ValueError for NaN
         with write_errors(folder):
             folder.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=folder.parent) as temporary:
-                new, old = Path(temporary, "new"), Path(temporary, "old")
-                new.mkdir()
-                np.savez_compressed(new / _DRAWS, positions=self.positions.astype(np.float32))
-                write_json(new / _CERTIFICATE, self.certificate)
-                try:
-                    if folder.exists():
-                        folder.rename(old)
-                    new.rename(folder)
-                except BaseException:
-                    if old.exists() and not folder.exists():
-                        old.rename(folder)
-                    raise
+                draws, certificate = Path(temporary, _DRAWS), Path(temporary, _CERTIFICATE)
+                np.savez_compressed(draws, positions=self.positions.astype(np.float32))
+                write_json(
+                    certificate, {"format": 1, **self.certificate, _CHECKSUM: _checksum(draws)}
+                )
+                folder.mkdir(exist_ok=True)
+                os.replace(draws, folder / _NEW)
+                os.replace(certificate, folder / _CERTIFICATE)
+            # Another process that writes the same reference may have renamed them.
+            with suppress(FileNotFoundError):
+                os.replace(folder / _NEW, folder / _DRAWS)
         return folder
 
     @classmethod
@@ -130,11 +139,22 @@ class StoredReference:
         """Read a reference written by :meth:`save`; raise ``ValueError`` if a file is invalid."""
         folder = Path(folder)
         try:
-            certificate = read_json(folder / _CERTIFICATE)
-            return cls(read_arrays(folder / _DRAWS)["positions"], dict(certificate))
+            certificate = dict(read_json(folder / _CERTIFICATE))
+            check_format(certificate)
+            # References of earlier versions have no checksum.
+            checksum, path = certificate.pop(_CHECKSUM, None), folder / _NEW
+            if checksum is None or not path.exists() or _checksum(path) != checksum:
+                path = folder / _DRAWS
+            if checksum is not None and _checksum(path) != checksum:
+                raise ValueError(f"the checksum of {_DRAWS} is not that in the certificate")
+            return cls(read_arrays(path)["positions"], certificate)
         except (ValueError, KeyError, TypeError) as error:
             files = f"{_DRAWS} and {_CERTIFICATE} of probmotion reference"
             raise ValueError(f"{folder} must contain {files} ({str(error)[:200]})") from error
+
+
+def _checksum(path: Path) -> str:
+    return f"{zlib.crc32(path.read_bytes()):08x}"
 
 
 def fingerprint_of(posterior: MotionPosterior, positions: np.ndarray) -> list[float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from html import escape
 from typing import TYPE_CHECKING
 
@@ -29,57 +29,69 @@ _HELD_OUT = "held-out poses"
 _REFERENCE = "reference draws"
 
 
-def shown_problems(comparison: GridResults, budget: int = BUDGET) -> dict[str, Shown]:
-    """Return the motions to show for each problem, at most 4 draws or 6 poses of each sampler.
+def shown_problems(comparison: GridResults, budget: int = BUDGET) -> Iterator[Shown | None]:
+    """Yield the motions to show for each problem, at most 4 draws or 6 poses of each sampler.
 
-    Draws, then frames, are omitted until the motions fit into ``budget`` bytes. Problems without
-    motions are omitted.
+    Draws, then frames, are omitted until the motions fit into ``budget`` bytes. A problem without
+    motions yields None. Draws are read when they are needed, so that the memory does not grow with
+    the number of runs.
     """
-    problems = {}
-    for name in comparison.plan.problems:
-        if (shown := _shown(comparison, name)) is not None:
-            problems[name] = shown
-    size = 2 * sum(row.size for shown in problems.values() for row in shown.rows.values())
+    problems = list(comparison.plan.problems)
+    size = 2 * sum(_size(comparison, name) for name in problems)
     fraction = next(
         (n / _DRAWS for n in range(_DRAWS, 1, -1) if n / _DRAWS * size <= budget), 1 / _DRAWS
     )
     step = max(1, int(np.ceil(fraction * size / budget)))
-    return {
-        name: Shown(
-            shown.problem,
-            {
-                label: choose_draws(row, max(1, round(fraction * len(row))))
-                for label, row in shown.rows.items()
-            },
-            step,
-        )
-        for name, shown in problems.items()
+    for name in problems:
+        yield _shown(comparison, name, _first_runs(comparison, name), fraction, step)
+
+
+def _first_runs(comparison: GridResults, name: str) -> dict[str, int]:
+    """Return the samplers with draws of a problem, with their first seeds that have draws."""
+    runs = {
+        result.sampler: result.seed
+        for result in reversed(comparison.results)
+        if result.problem == name and result.failure is None
     }
+    return {sampler: runs[sampler] for sampler in comparison.plan.samplers if sampler in runs}
 
 
-def _shown(comparison: GridResults, name: str) -> Shown | None:
-    drawn, skeleton, fps = {}, None, 0.0
-    for result in comparison.results:
-        if result.problem != name or result.failure is not None or result.sampler in drawn:
-            continue
-        draws = comparison.draws(name, result.sampler, result.seed)
-        skeleton, fps = draws.skeleton, draws.fps
-        motions = draws.flat()
-        drawn[result.sampler] = choose_draws(
-            motions, _DRAWS if motions.shape[1] > 1 else _MAX_POSES
-        )
+def _size(comparison: GridResults, name: str) -> int:
+    """Return the number of coordinates to show, as if all samplers had those of the first."""
+    runs = _first_runs(comparison, name)
+    shown = _shown(comparison, name, dict(list(runs.items())[:1]))
+    if shown is None:
+        return 0
+    sizes = [row.size for row in shown.rows.values()]
+    return sum(sizes) + max(0, len(runs) - 1) * sizes[-1]
+
+
+def _shown(
+    comparison: GridResults,
+    name: str,
+    runs: Mapping[str, int],
+    fraction: float = 1.0,
+    step: int = 1,
+) -> Shown | None:
+    """Return the motions of stored draws and of runs, a seed by sampler."""
     problem = read_stored(comparison.folder / "problems" / name)
-    if problem is None:
-        if skeleton is None:
-            return None
-        problem = StoredProblem(skeleton, fps)
     rows: dict[str, np.ndarray] = {}
-    if problem.held_out is not None:
-        rows[_HELD_OUT] = choose_draws(problem.held_out, _MAX_POSES)
-    if problem.reference is not None:
-        rows[_REFERENCE] = choose_draws(problem.reference, _DRAWS)
-    rows |= {label: drawn[label] for label in comparison.plan.samplers if label in drawn}
-    return Shown(problem, rows) if rows else None
+    if problem is not None and problem.held_out is not None:
+        rows[_HELD_OUT] = _thinned(problem.held_out, _MAX_POSES, fraction)
+    if problem is not None and problem.reference is not None:
+        rows[_REFERENCE] = _thinned(problem.reference, _DRAWS, fraction)
+    for sampler, seed in runs.items():
+        draws = comparison.draws(name, sampler, seed)
+        problem = problem or StoredProblem(draws.skeleton, draws.fps)
+        n = _DRAWS if draws.positions.shape[2] > 1 else _MAX_POSES
+        rows[sampler] = _thinned(draws.flat(), n, fraction)
+    return Shown(problem, rows, step) if problem is not None and rows else None
+
+
+def _thinned(motions: np.ndarray, n: int, fraction: float) -> np.ndarray:
+    """Return a fraction of at most n evenly spaced draws."""
+    chosen = choose_draws(motions, n)
+    return choose_draws(chosen, max(1, round(fraction * len(chosen))))
 
 
 def featured_problem(comparison: GridResults) -> str:
@@ -98,20 +110,17 @@ def compared_draws(comparison: GridResults, name: str, verdicts: Mapping[str, Ve
     Joints are coloured by their standard deviation.
     """
     samplers = _compared(comparison, name, verdicts)
-    drawn = {sampler: comparison.draws(name, sampler, seed) for sampler, seed in samplers.items()}
     problem = read_stored(comparison.folder / "problems" / name)
-    if problem is None:
-        if not drawn:
-            return ""
-        first = next(iter(drawn.values()))
-        problem = StoredProblem(first.skeleton, first.fps)
     rows: dict[str, np.ndarray] = {}
-    if problem.truth is not None:
+    if problem is not None and problem.truth is not None:
         rows["truth"] = problem.truth[None]
-    elif problem.reference is not None:
+    elif problem is not None and problem.reference is not None:
         rows[_REFERENCE] = problem.reference
-    rows |= {label: choose_draws(draws.flat(), _MAX_MEASURED) for label, draws in drawn.items()}
-    if not rows:
+    for sampler, seed in samplers.items():
+        draws = comparison.draws(name, sampler, seed)
+        problem = problem or StoredProblem(draws.skeleton, draws.fps)
+        rows[sampler] = choose_draws(draws.flat(), _MAX_MEASURED)
+    if problem is None or not rows:
         return ""
     captions = {
         label: f"{label}: {verdict_text(comparison, name, label)}" if label in verdicts else label

@@ -83,8 +83,8 @@ def _page(comparison: GridResults, calibration: Calibration | None) -> str:
     images = {name: _quality_image(name, plot) for name, plot in plots.items()}
     featured = images.pop(featured_problem(comparison))
     sections = [
-        _section(comparison, table, name, i, shown.get(name), outcomes[name], images.get(name, ""))
-        for i, name in enumerate(plan.problems)
+        _section(comparison, table, name, i, each, outcomes[name], images.get(name, ""))
+        for i, (name, each) in enumerate(zip(plan.problems, shown, strict=True))
     ]
     if calibration is not None:
         sections.append(_calibration(calibration, ranks))

@@ -230,6 +230,7 @@ UNNUMBERED = {
     "chain": edit_archive("chain.npz", set_format),
     "stored problem": edit_archive("problem.npz", set_format),
     "decomposition": edit_json("decompose_error.json"),
+    "reference": edit_json("toy/certificate.json"),
 }
 # Runs and pilots are read by the plan of their grid.
 NUMBERED = UNNUMBERED | {

@@ -241,8 +241,12 @@ def test_only_differences_over_several_seeds_are_highlighted(tmp_path, n_seeds):
     assert 'title="best">★' not in write(made, tmp_path)
 
 
+def shown_by_name(made, **budget):
+    return dict(zip(made.plan.problems, shown_problems(made, **budget), strict=True))
+
+
 def test_motions_are_encoded_in_millimetres(made):
-    shown = shown_problems(made)["joints"]
+    shown = shown_by_name(made)["joints"]
     data = motion_numbers(shown)
     path = WALK.positions[:, list(WALK.skeleton.roots)].mean(axis=1) * [1, 0, 1]
     truth = decode(data["truth"], data["joints"])
@@ -265,12 +269,12 @@ def test_motions_beyond_16_bits_have_a_coarser_unit():
 
 
 def test_large_grids_show_fewer_draws_then_fewer_frames(made):
-    full = shown_problems(made)
+    full = shown_by_name(made)
     size = 2 * sum(row.size for shown in full.values() for row in shown.rows.values())
-    half = shown_problems(made, budget=size // 2)["joints"]
+    half = shown_by_name(made, budget=size // 2)["joints"]
     assert [len(row) for row in half.rows.values()] == [1, 2, 2]
     assert half.step == 1
-    least = shown_problems(made, budget=size // 16)["joints"]
+    least = shown_by_name(made, budget=size // 16)["joints"]
     assert (len(least.rows["good"]), least.step) == (1, 4)
     assert motion_numbers(least)["frames"] == least.frames == 3
     assert motion_numbers(least)["fps"] == 7.5
@@ -349,8 +353,8 @@ def test_a_calibration_without_ranks_has_no_figure(made, tmp_path):
 
 def test_figures_reduce_the_budget_of_the_motions(made, tmp_path, monkeypatch):
     budgets = []
-    shown = "probmotion.report.page.shown_problems"
-    monkeypatch.setattr(shown, lambda comparison, budget: budgets.append(budget) or {})
+    shown, none = "probmotion.report.page.shown_problems", [None] * len(made.plan.problems)
+    monkeypatch.setattr(shown, lambda comparison, budget: budgets.append(budget) or none)
     page = write(made, tmp_path, Calibrated())
     figures = [base64.b64decode(text) for text in re.findall(r';base64,([^"]*)" alt', page)]
     assert len(figures) == len(made.plan.problems) + 1
