@@ -131,6 +131,9 @@ STUDIES = {
                 steps=95, levels=LogSNR(), integrator=SecondOrderSDE(), elevation=0.0
             ),
             "mvpc, elevation 0": MultiViewPredictorCorrector(steps=58, elevation=0.0),
+            "mvpc, elevation 0, gamma 0": MultiViewPredictorCorrector(
+                steps=58, elevation=0.0, gamma=0.0
+            ),
             "mvpc, elevation 11": MultiViewPredictorCorrector(steps=58, elevation=np.pi / 16),
             "mvpc, elevation 35": MultiViewPredictorCorrector(
                 steps=58, elevation=np.arctan(0.5**0.5)
@@ -186,6 +189,34 @@ STUDIES = {
             "mvpc, 3 correctors": MultiViewPredictorCorrector(corrector_steps=3),
             "mvpc, 100 levels": MultiViewPredictorCorrector(steps=100),
             "mvpc, accurate": MultiViewPredictorCorrector.accurate(),
+        },
+    ),
+    "tuning": Study(
+        "noise covariance and corrector of mvpc, at 474 evaluations",
+        ("gait", "cmu", "quadruped"),
+        {
+            **{
+                f"gamma {gamma:g} from {start:g}, no corrector": MultiViewPredictorCorrector(
+                    steps=158, corrector_steps=0, gamma=gamma, gamma_from=start
+                )
+                for gamma, start in ((0, 1), (0.6, 0.2), (0.7, 0.2), (1, 1))
+            },
+            **{
+                f"gamma {gamma:g} from {start:g}, corrector {size:g}": MultiViewPredictorCorrector(
+                    steps=97,
+                    corrector_steps=1,
+                    corrector_size=size,
+                    gamma=gamma,
+                    gamma_from=start,
+                    corrected_from=1.0,
+                )
+                for gamma, start, size in (
+                    (0, 1, 0.6),
+                    (0.5, 1, 0.6),
+                    (0.5, 0.2, 0.3),
+                    (0.55, 0.2, 0.15),
+                )
+            },
         },
     ),
     "chains": Study(

@@ -47,7 +47,7 @@ class NoiseSchedule:
         if not one_axis or (np.diff([1.0, *levels[1:], 0.0]) >= 0).any() or levels[0] != 1.0:
             raise ValueError(
                 "alpha_bar must have shape (T + 1,) and decrease from 1 to a number above 0, got "
-                f"shape {levels.shape}"
+                f"shape {levels.shape}; use NoiseSchedule.cosine"
             )
         times = np.arange(len(levels)) if self.times is None else np.asarray(self.times)
         object.__setattr__(self, "alpha_bar", levels)

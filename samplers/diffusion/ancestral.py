@@ -15,7 +15,7 @@ import numpy as np
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.samplers.diffusion.guidance import can_guide
 from probmotion.samplers.diffusion.integrators import AnyIntegrator, Transition
-from probmotion.samplers.diffusion.noise_levels import NoiseLevels
+from probmotion.samplers.diffusion.noise_levels import NoiseLevels, check_object
 from probmotion.samplers.diffusion.states import State
 from probmotion.samplers.independent import Batches, IndependentSampler
 from probmotion.seeds import NormalStreams
@@ -92,6 +92,10 @@ class AncestralSampler(NoiseLevels, IndependentSampler):
     least_effort: ClassVar[int] = 2
 
     integrator: AnyIntegrator
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_object("integrator", self.integrator, AnyIntegrator)
 
     def _batches(self, posterior: MotionPosterior, seed: int, progress: bool) -> Batches:
         if getattr(self, "elevation", None) == 0:

@@ -21,7 +21,12 @@ from probmotion.posteriors.sampling import (
 )
 from probmotion.samplers.diffusion.ancestral import ancestral
 from probmotion.samplers.diffusion.integrators import DDPM, AnyIntegrator
-from probmotion.samplers.diffusion.noise_levels import AnyLevels, Cosine, NoiseLevels
+from probmotion.samplers.diffusion.noise_levels import (
+    AnyLevels,
+    Cosine,
+    NoiseLevels,
+    check_object,
+)
 from probmotion.samplers.diffusion.states import MotionState
 from probmotion.seeds import NormalStreams
 from probmotion.validation import check_count
@@ -54,6 +59,10 @@ class Ancestral2D(NoiseLevels):
     levels: AnyLevels = field(default_factory=Cosine)
     integrator: AnyIntegrator = field(default_factory=DDPM)
     batch: int = 256
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_object("integrator", self.integrator, AnyIntegrator)
 
     def sample_views(
         self,

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from types import UnionType
+from typing import get_args
 
 import numpy as np
 
 from probmotion.posteriors.noise_schedule import NoiseSchedule
 from probmotion.validation import check_count, check_positive
 
-__all__ = ["AnyLevels", "Cosine", "Karras", "LogSNR", "NoiseLevels"]
+__all__ = ["AnyLevels", "Cosine", "Karras", "LogSNR", "NoiseLevels", "check_object"]
 
 _SMALLEST, _LARGEST = 0.004, 80.0  # default noise levels, normalised units
+_DEFAULT_RANGE = f"smallest={_SMALLEST:g}, largest={_LARGEST:g}"
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,7 @@ class Karras:
 
     def schedule(self, steps: int) -> NoiseSchedule:
         """Return the schedule of a number of levels."""
-        check_count("steps", steps)
+        check_count("steps", steps, least=2)
         power = 1 / self.rho
         return _of_noise(np.linspace(self.smallest**power, self.largest**power, steps) ** self.rho)
 
@@ -85,7 +88,7 @@ class LogSNR:
 
     def schedule(self, steps: int) -> NoiseSchedule:
         """Return the schedule of a number of levels."""
-        check_count("steps", steps)
+        check_count("steps", steps, least=2)
         return _of_noise(np.geomspace(self.smallest, self.largest, steps))
 
 
@@ -101,6 +104,7 @@ class NoiseLevels:
 
     def __post_init__(self) -> None:
         check_count("batch", self.batch)
+        check_object("levels", self.levels, AnyLevels)
         # Creating the schedule validates the other settings.
         check_count("steps", self.schedule.steps)
 
@@ -110,13 +114,28 @@ class NoiseLevels:
         return self.levels.schedule(self.steps)
 
 
+def check_object(name: str, value: object, kinds: UnionType) -> None:
+    """Raise ``ValueError`` unless ``value`` is an instance of one of the classes of a union."""
+    if not isinstance(value, kinds):
+        names = [f"{kind.__name__}()" for kind in get_args(kinds)]
+        raise ValueError(f"{name} must be {', '.join(names[:-1])} or {names[-1]}, got {value!r}")
+
+
 def _of_noise(sigma: np.ndarray) -> NoiseSchedule:
     """Return the schedule with ascending noise levels σ_1, …, σ_T."""
-    return NoiseSchedule(np.concatenate([[1.0], 1 / (1 + sigma**2)]))
+    alpha_bar = np.concatenate([[1.0], 1 / (1 + sigma**2)])
+    if (np.diff(alpha_bar) >= 0).any():
+        raise ValueError(
+            f"noise must increase with every level, got {len(sigma)} levels between "
+            f"{sigma[0]:g} and {sigma[-1]:g} that rounding makes equal; use {_DEFAULT_RANGE}"
+        )
+    return NoiseSchedule(alpha_bar)
 
 
 def _check_range(smallest: float, largest: float) -> None:
     check_positive("smallest", smallest)
     check_positive("largest", largest)
     if smallest >= largest:
-        raise ValueError(f"smallest must be below largest, {largest:g}, got {smallest:g}")
+        raise ValueError(
+            f"smallest must be below largest, {largest:g}, got {smallest:g}; use {_DEFAULT_RANGE}"
+        )

@@ -14,7 +14,7 @@ from probmotion.samplers import MultiViewPredictorCorrector
 from probmotion.samplers.diffusion import DDIM, DDPM, Cosine, Heun, Karras, LogSNR, SecondOrderSDE
 from probmotion.samplers.diffusion.ancestral import ancestral
 from probmotion.samplers.diffusion.states import MotionState
-from probmotion.samplers.diffusion.views import MotionDenoiser
+from probmotion.samplers.diffusion.views import MotionDenoiser, pools, view_sets
 from probmotion.seeds import NormalStreams
 
 ALL = [DDPM(), DDIM(), SecondOrderSDE(), Heun()]
@@ -62,7 +62,39 @@ def test_order_of_convergence(integrator, order, variance, levels):
     assert fine == pytest.approx(variance, rel=0.02 if order == 1 else 2e-4)
     errors = [abs(variance_of(integrator, levels.schedule(n), variance) - variance) for n in steps]
     slope = np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    print(f"{integrator.kind}, {levels.kind}, variance {variance:g}: order {-slope:.2f}")
     assert slope == pytest.approx(-order, abs=0.15)
+
+
+@pytest.mark.parametrize(("integrator", "order"), list(zip(ALL, (1, 1, 2, 2), strict=True)))
+def test_order_of_convergence_with_alternating_views(gaussian, integrator, order):
+    """Steps that combine estimates of two sets of views keep their order."""
+    prior = replace(gaussian, mean=np.zeros_like(gaussian.mean))
+    size = prior.mean.size
+
+    class Units:
+        """Streams that return each unit vector once."""
+
+        def __init__(self, steps):
+            self.steps, self.calls = steps, 0
+
+        def normal(self, *shape):
+            noise = np.zeros((self.steps, size, size))
+            noise[self.calls] = np.eye(size)
+            self.calls += 1
+            return noise.reshape(-1, *shape)
+
+    def covariance(steps):
+        denoisers = pools(prior, view_sets(prior, 3, None))
+        state = MotionState(denoisers, LogSNR(1e-3, 1e2).schedule(steps), prior.mean.shape)
+        gains = ancestral(state, Units(steps), lambda: None, integrator).reshape(-1, size)
+        return gains.T @ gains
+
+    results = [covariance(steps) for steps in (40, 80, 160)]
+    changes = [np.abs(after - before).max() for before, after in pairwise(results)]
+    slope = np.log2(changes[1] / changes[0])
+    print(f"{integrator.kind}, alternating views: order {-slope:.2f}")
+    assert slope == pytest.approx(-order, abs=0.3)
 
 
 def test_second_order_steps_agree_with_diffusers():
