@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from pathlib import Path
 
+import motion_files as files
 import numpy as np
 import pandas as pd
 import pytest
@@ -17,6 +18,7 @@ import probmotion as pm
 from probmotion.cli.main import main
 from probmotion.data.synthetic.gaits import make_gait
 from probmotion.extras import is_installed
+from probmotion.io.keypoints.calibration import read_calibration
 from probmotion.metrics.stein import NoGradient, score_of
 from probmotion.posteriors.draws import MotionDraws, library_versions
 from probmotion.posteriors.sampling import importable_samplers, sampler_names
@@ -56,6 +58,43 @@ def test_motions_are_written_and_read(suffix, tmp_path):
     pm.save(walk, tmp_path / f"walk{suffix}")
     read = pm.read_joints(tmp_path / f"walk{suffix}").joints
     np.testing.assert_allclose(read, walk.positions, atol=0.02)
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".csv"])
+def test_motions_are_written_for_other_programs(suffix, tmp_path):
+    pm.save(make_gait("walk", frames=12), tmp_path / f"walk{suffix}")
+    content = (tmp_path / f"walk{suffix}").read_bytes()
+    assert content.startswith(b"glTF") if suffix == ".glb" else content.count(b"\n") > 12
+
+
+@pytest.mark.filterwarnings("ignore::probmotion.io.errors.MotionFileWarning")
+def test_motions_and_cameras_of_other_programs_are_read(tmp_path):
+    for name, content in (
+        ("clip.asf", files.ASF),
+        ("clip.amc", files.AMC),
+        ("c.toml", files.CAMERAS),
+    ):
+        (tmp_path / name).write_bytes(content)
+    assert pm.load(tmp_path / "clip.amc", up="y").frames == 2
+    assert read_calibration(tmp_path / "c.toml").names == ("left",)
+
+
+@pytest.mark.filterwarnings("ignore::probmotion.io.errors.MotionFileWarning")
+@pytest.mark.parametrize(
+    ("suffix", "contents"),
+    {
+        ".json": files.JSONS,  # COCO, AlphaPose, OpenPose, MMPose, RTMPose, MediaPipe
+        ".csv": [files.TABLE, files.LANDMARK_TABLE],  # DeepLabCut, MediaPipe
+        ".h5": files.HDF5,  # SLEAP, movement, DeepLabCut
+        ".npz": files.ARCHIVES[1:],
+    }.items(),
+)
+def test_keypoints_of_every_detector_are_read(suffix, contents, tmp_path):
+    for content in contents:
+        (tmp_path / f"clip{suffix}").write_bytes(content)
+        for track in pm.read_keypoints(tmp_path / f"clip{suffix}", fps=30):
+            assert track.keypoints.size
+            assert (track.confidence > 0).any()
 
 
 def test_a_comparison_has_a_table_a_report_and_rows_of_samplers_without_their_extra(

@@ -4,26 +4,67 @@ from __future__ import annotations
 
 import json
 import threading
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
+import numpy as np
 import pytest
 from live_browser import LiveBrowser
 from made_reports import MARKUP, WALK, MadeComparison, filmed_problem
 
+from probmotion import Cameras, Motion, Skeleton
+from probmotion.lifting.checks import Check
+from probmotion.lifting.page import lift_page
+from probmotion.lifting.pair_page import pair_page
 from probmotion.plots.animation import animate_skeletons
 from probmotion.report.page import write_report
+from tests.models.images.bodies import small_quadruped
 
 HOSTILE = "<img src=x onerror=document.title=1>"
+NAME = HOSTILE + MARKUP
+CHECKS = [Check(NAME, 2.0, 1.0, NAME)]
+PERSON = Skeleton.preset("person14")
+POSITIONS = WALK.retarget(PERSON).positions
+JOINTS = Skeleton([joint + NAME for joint in PERSON.joint_names], PERSON.parents)
+MOTION = Motion(POSITIONS, JOINTS, 30.0, name=NAME)
+DRAWS = POSITIONS + 0.02 * np.random.default_rng(0).normal(size=(4, *POSITIONS.shape))
 
 
 def write_animation(path):
-    motions = {HOSTILE + MARKUP: WALK.positions[None]}
-    animate_skeletons(motions, WALK.skeleton, path, fps=30, title=HOSTILE + MARKUP)
+    motions = {NAME: WALK.positions[None]}
+    animate_skeletons(motions, WALK.skeleton, path, fps=30, title=NAME)
 
 
 def write_comparison(path):
     samplers = {"good": 1.0, HOSTILE: 4.0}
     write_report(MadeComparison(path.parent, [filmed_problem(3)], samplers), path)
+
+
+def write_lift(path):
+    """Users name the video, its cameras and, through a prior, the joints."""
+    cameras = Cameras.ring(2, elevation=0.2)
+    shown = [cameras, [NAME, NAME], cameras.project(POSITIONS)]
+    path.write_text(lift_page(MOTION, DRAWS, *shown, CHECKS, [NAME]), encoding="utf-8")
+
+
+def write_pairs(path):
+    """Users name the videos and the folder, which is part of the command."""
+    shown = [np.full_like(POSITIONS, 0.1), DRAWS, POSITIONS[..., :2], np.ones(len(POSITIONS))]
+    path.write_text(pair_page(MOTION, *shown, [NAME], path.parent / HOSTILE), encoding="utf-8")
+
+
+def write_reconstruction(path):
+    """Users name the category."""
+    category = replace(small_quadruped(), name=NAME)
+    from probmotion.models.images.observation import ImageObservation
+    from probmotion.models.images.surface_prior import SurfacePrior
+    from probmotion.reconstruction.page import reconstruction_page
+
+    prior = SurfacePrior(category, np.array([0.15]))
+    theta, mask = np.full(prior.dim, 0.1), np.eye(32)[None]
+    observation = ImageObservation(mask, None, None, prior.tangent, np.eye(3)[None])
+    page = reconstruction_page(observation, prior, theta, {NAME: theta}, CHECKS, [NAME])
+    path.write_text(page, encoding="utf-8")
 
 
 @pytest.fixture
@@ -65,7 +106,10 @@ LOADS = """(async (url) => {
 })(%s)"""
 
 
-@pytest.mark.parametrize("write", [write_animation, write_comparison, None])
+@pytest.mark.parametrize(
+    "write",
+    [write_animation, write_comparison, write_lift, write_pairs, write_reconstruction, None],
+)
 def test_names_stay_text_and_nothing_is_loaded(write, tmp_path, server):
     page = tmp_path / "page.html"
     if write is None:  # without a policy, the same page does load
