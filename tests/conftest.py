@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -43,6 +44,15 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         torch.set_num_threads(1)
         if item.get_closest_marker("gpu") and not torch.cuda.is_available():
             pytest.skip("needs CUDA; run make gpu on a machine with it")
+
+
+@pytest.fixture
+def few_objects() -> Iterator[None]:
+    """Let the garbage collector look at new objects only; earlier tests leave millions."""
+    gc.collect()
+    gc.freeze()
+    yield
+    gc.unfreeze()
 
 
 @dataclass(frozen=True)

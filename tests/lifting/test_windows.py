@@ -30,6 +30,7 @@ class Window:
         return np.repeat(self.mean(times)[None], n, axis=0)
 
 
+@pytest.mark.usefixtures("few_objects")
 def test_windows_are_averaged_and_released():
     most = []
 

@@ -49,6 +49,7 @@ class Watched(MadeComparison):
         return draws
 
 
+@pytest.mark.usefixtures("few_objects")
 def test_draws_are_read_one_by_one(tmp_path):
     problems = [generation_problem(), joints_problem()]
     made = Watched(tmp_path, problems, dict.fromkeys("abc", 1.0))
