@@ -185,8 +185,9 @@ Image("quality.png")
 #   how likely the observations are in it.
 # - `mas` adds errors of single views: its variance is almost twice the correct one.
 # - `mvpc` has a smaller error at the same number of denoiser evaluations, since its views cover the sphere.
-# - `split-gibbs` is exact within a style, but starts from guided draws and does not change their style. Where the
-#   observations leave one mode, as in the problem `gait-monocular`, it is right.
+# - `split-gibbs` is exact within a style, but does not change the style of its start: one of eight guided draws, weighted
+#   by how likely the observations are. The proportions are closer than those of `ancestral3d`, and not yet right. Where
+#   the observations leave one mode, as in the problem `gait-monocular`, it is right.
 # - `mh` is as close as exact draws, but its chains have not converged (R-hat far above 1.01, few effective
 #   draws). It also requires a log density, which a learnt 2D model does not have.
 #

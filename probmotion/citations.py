@@ -17,6 +17,10 @@ _SOLVER = (
     "Lu, Zhou, Bao, Chen, Li, Zhu (2022). DPM-Solver++: fast solver for guided sampling of "
     "diffusion probabilistic models. arXiv:2211.01095."
 )
+_TWISTED = (
+    "Wu, Trippe, Naesseth, Blei, Cunningham (2023). Practical and asymptotically exact "
+    "conditional sampling in diffusion models. NeurIPS."
+)
 _HMC = "Neal (2011). MCMC using Hamiltonian dynamics. Handbook of Markov Chain Monte Carlo."
 _MAS = (
     "Kapon, Tevet, Cohen-Or, Bermano (2024). MAS: multi-view ancestral sampling for 3D motion "
@@ -42,6 +46,7 @@ CITATIONS: Mapping[str, tuple[str, ...]] = {
         "large-scale inference problems. IEEE Trans. Signal Processing 67.",
         "Wu, Sun, Chen, Zhang, Yue, Bouman (2024). Principled probabilistic imaging using "
         "diffusion models as plug-and-play priors. NeurIPS.",
+        _TWISTED,
         _SOLVER,
         _KARRAS,
     ),
@@ -53,10 +58,7 @@ CITATIONS: Mapping[str, tuple[str, ...]] = {
         "Mardani, Song, Kautz, Vahdat (2024). A variational perspective on solving inverse "
         "problems with diffusion models. ICLR.",
     ),
-    "tds": (
-        "Wu, Trippe, Naesseth, Blei, Cunningham (2023). Practical and asymptotically exact "
-        "conditional sampling in diffusion models. NeurIPS.",
-    ),
+    "tds": (_TWISTED,),
     "sync-tweedies": (
         "Kim, Koo, Yeo, Sung (2024). SyncTweedies: a general generative framework based on "
         "synchronized diffusions. NeurIPS.",

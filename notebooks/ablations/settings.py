@@ -87,15 +87,16 @@ def conditional_methods(budget: int) -> dict[str, Sampler]:
     """Return methods of conditioning 2D denoisers, at a number of evaluations a draw."""
     # Exact denoisers have three views at a time, those of `mas` five.
     estimates = budget // 3
-    start = 50  # estimates of the guided start of split Gibbs, and 1.25 for each step
+    # Split Gibbs has 1.25 estimates a step and 48 for its sweeps. Its default start would take all
+    # of 500 evaluations.
+    split = SplitGibbs(denoiser="2d", particles=2 if budget < 1000 else 8)
+    started = split.particles * split.start_steps
     samplers: dict[str, Sampler] = {
         "mas": MultiViewAncestral(steps=budget // 5),
         "mas, dps": MultiViewAncestral(steps=budget // 5, guidance=DPS()),
         "mas, replacement": MultiViewAncestral(steps=budget // 5, guidance=Replacement()),
         "mvpc": MultiViewPredictorCorrector(steps=round(estimates / 1.63)),
-        "split-gibbs": SplitGibbs(
-            denoiser="2d", steps=max(0, round((estimates - start - 48) / 1.25))
-        ),
+        "split-gibbs": replace(split, steps=round((estimates - started - 48) / 1.25)),
         "daps": DAPS(denoiser="2d", steps=estimates // 5),
         "red-diff": REDDiff(denoiser="2d", steps=estimates),
         "sync-tweedies": SyncTweedies(steps=estimates),

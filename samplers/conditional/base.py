@@ -120,11 +120,16 @@ class AnnealedSampler(NoiseLevels, ConditionalSampler):
         NoiseLevels.__post_init__(self)
         ConditionalSampler.__post_init__(self)
 
+    @property
+    def sigmas(self) -> np.ndarray:
+        """Noise levels, falling, (T,)."""
+        return np.array([self.schedule.sigma(t) for t in range(self.steps, 0, -1)])
+
     def _batches(self, posterior: MotionPosterior, seed: int, progress: bool) -> Batches:
         observations = self._observations(posterior)
         pools = self._pools(posterior)
         shape = (posterior.frames, posterior.skeleton.n_joints, 3)
-        sigmas = np.array([self.schedule.sigma(t) for t in range(self.steps, 0, -1)])
+        sigmas = self.sigmas
 
         def draw(streams: NormalStreams, tick: Callable[[], Any]) -> np.ndarray:
             return self._draw(pools, observations, shape, sigmas, streams, tick)

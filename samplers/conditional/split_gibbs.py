@@ -7,6 +7,10 @@ diffusion from noise level ρ, started at z (Wu et al. 2024, Xu and Chi 2024). P
 and Student-t noise have Metropolis-Hastings steps of z, and precision factors of their entries
 (:mod:`~probmotion.samplers.conditional.z_steps`).
 
+Sweeps do not change the mode of a start. Guided diffusion chooses modes with wrong probabilities,
+even with the exact 3D denoiser. Each draw therefore starts from one of several guided particles,
+resampled by the weights of twisted diffusion (Wu et al. 2023) down to the levels that choose modes.
+
 Sweeps move by about ρ, and need thousands to cross the unobserved depth. The marginal of z,
 p_ρ(z) N(y; A z, σ_y² − ρ²), has the score (D(z, ρ) − z)/ρ² + Aᵀ (y − A z)/(σ_y² − ρ²) at the cost
 of one estimate D, so underdamped Langevin dynamics of z under falling ρ come before the sweeps. For
@@ -33,15 +37,13 @@ from probmotion.samplers.conditional.base import (
 )
 from probmotion.samplers.conditional.coupling import Coupling, Quadratic, times
 from probmotion.samplers.conditional.keypoints import Observations
+from probmotion.samplers.conditional.twisted import TwistedDiffusion
 from probmotion.samplers.conditional.z_steps import GaussianStep, MetropolisStep, ZStep
-from probmotion.samplers.diffusion.ancestral import AncestralSampler, reverse_diffusion
-from probmotion.samplers.diffusion.ancestral3d import Ancestral3D
-from probmotion.samplers.diffusion.guidance import can_guide
+from probmotion.samplers.diffusion.ancestral import reverse_diffusion
+from probmotion.samplers.diffusion.guidance import MomentMatched, can_guide, guide_towards
 from probmotion.samplers.diffusion.integrators import SecondOrderSDE
-from probmotion.samplers.diffusion.mvpc import MultiViewPredictorCorrector
 from probmotion.samplers.diffusion.noise_levels import Karras
 from probmotion.samplers.diffusion.states import MotionState
-from probmotion.samplers.diffusion.views import MotionDenoiser
 from probmotion.samplers.independent import Batches
 from probmotion.seeds import NormalStreams
 from probmotion.validation import check_count, check_positive
@@ -50,8 +52,10 @@ __all__ = ["SplitGibbs"]
 
 _PRIOR = 80.0  # noise level at which a noisy motion says nothing of the clean one
 _RINGS = 3  # of views of learnt denoisers
+_START = Karras(smallest=0.2)  # levels of the start; modes are chosen above the last
 _STEPS_PER_LEVEL = 4  # Langevin steps at one ρ
-_ANNEALED_TO = 0.7  # last ρ of the Langevin dynamics, in σ_y
+_ANNEALED_FROM = 0.2  # first ρ of the Langevin dynamics, normalised; above, they leave the mode
+_ANNEALED_TO = 0.7  # last ρ, in σ_y
 _STEP, _FRICTION = 0.7, 0.2  # of the Langevin dynamics, in units of the coupling's deviations
 _END = 0.1  # last noise level of the reverse diffusion, in ρ
 _POWER = 5  # of its spacing (Karras et al. 2022, equation 5)
@@ -59,7 +63,7 @@ _POWER = 5  # of its spacing (Karras et al. 2022, equation 5)
 
 @dataclass(frozen=True)
 class SplitGibbs(ConditionalSampler):
-    """Split Gibbs sampler with a diffusion prior, started by guided sampling.
+    """Split Gibbs sampler with a diffusion prior, started by weighted guided sampling.
 
     Observations are keypoints, joints, or others that are linear with Gaussian noise.
 
@@ -71,14 +75,14 @@ class SplitGibbs(ConditionalSampler):
         Number of Gibbs sweeps at the last ρ.
     inner_steps : int
         Number of estimates of each reverse diffusion.
-    largest : float
-        First ρ, normalised units. Larger values leave the mode of the guided start.
     share : float
         Last ρ in units of the smallest σ_y, below 1. With several cameras, σ_y is that of a joint
         given all of them; with Student-t noise, that of the largest precision factor; with
         perspective cameras, that at half of the mean depth.
     start_steps : int
-        Number of noise levels of the guided start.
+        Number of noise levels of the start.
+    particles : int
+        Number of particles of the start, of which one continues.
     denoiser : {"any", "3d", "2d"}
         Kind of denoiser; "any" is the 3D denoiser if the prior has one.
     n_views : int
@@ -91,13 +95,14 @@ class SplitGibbs(ConditionalSampler):
     """
 
     name: ClassVar[str] = "split-gibbs"
+    effort: ClassVar[tuple[str, ...]] = ("steps", "particles")
 
     steps: int = 400
     sweeps: int = 5
     inner_steps: int = 8
-    largest: float = 0.4
     share: float = 0.95
-    start_steps: int = 30
+    start_steps: int = 24
+    particles: int = 8
     denoiser: DenoiserChoice = "any"
     n_views: int = 5
     elevation: float | None = None
@@ -107,9 +112,9 @@ class SplitGibbs(ConditionalSampler):
         super().__post_init__()
         for name, least in (("steps", 0), ("sweeps", 1), ("inner_steps", 2), ("start_steps", 2)):
             check_count(name, getattr(self, name), least=least)
+        check_count("particles", self.particles, least=2)
         check_count("n_views", self.n_views, least=3)
         check_count("batch", self.batch)
-        check_positive("largest", self.largest)
         check_positive("share", self.share)
         if self.share >= 1:
             raise ValueError(
@@ -125,20 +130,6 @@ class SplitGibbs(ConditionalSampler):
             return True
         return likelihood is not None and can_guide(posterior)
 
-    def _start(self, in_3d: bool) -> AncestralSampler:
-        """Return the guided sampler of the starting points."""
-        if in_3d:
-            return Ancestral3D(steps=self.start_steps, levels=Karras(smallest=0.04))
-        return MultiViewPredictorCorrector(
-            steps=self.start_steps,
-            levels=Karras(smallest=0.1),
-            n_views=self.n_views,
-            elevation=self.elevation,
-            gamma=0.0,
-            corrected_from=0.4,
-            corrector_size=0.3,
-        )
-
     def _batches(self, posterior: MotionPosterior, seed: int, progress: bool) -> Batches:
         if not self.draws_from(posterior) and posterior.likelihood is not None:
             raise UnsupportedPosterior(
@@ -150,21 +141,21 @@ class SplitGibbs(ConditionalSampler):
             )
         pools = self._pools(posterior, self.n_views, self.elevation, rings=_RINGS)
         step, linear = self._step(posterior, pools[0])
-        start = self._start(isinstance(pools[0].denoiser, MotionDenoiser))._batches(
-            linear, seed, progress
-        )
-        sources = [start.counts, pools[0].denoiser.counts]
-        counts = {"denoiser": 0}
+        observations = self._observations(linear)
+        guide_towards(self, linear, MomentMatched(), pools[0].denoiser)  # or raise an error
+        start = TwistedDiffusion(steps=self.start_steps, particles=self.particles, levels=_START)
+        shape = (posterior.frames, posterior.skeleton.n_joints, 3)
+        one_pool = len(pools) == 1  # estimates of different pools do not extrapolate
 
         def draw(streams: NormalStreams, tick: Callable[[], Any]) -> np.ndarray:
-            x = start.draw(streams, tick)
-            x = self._anneal(pools, step, x, streams, tick)
-            x = self._sweep(pools, step, x, streams, tick)
-            for name in {name for source in sources for name in source}:
-                counts[name] = sum(source.get(name, 0) for source in sources)
-            return x
+            particles = start.filtered(
+                pools, observations, shape, start.sigmas, streams, tick, second_order=one_pool
+            )
+            x = self._anneal(pools, step, particles.chosen(streams), streams, tick)
+            return self._sweep(pools, step, x, streams, tick)
 
-        ticks = start.steps + self.steps + self.sweeps
+        ticks = self.start_steps - 1 + self.steps + self.sweeps
+        counts = pools[0].denoiser.counts
         scale = posterior.prior.scale  # type: ignore[attr-defined]
         return Batches(draw, self.batch, ticks, scale, counts)
 
@@ -205,7 +196,7 @@ class SplitGibbs(ConditionalSampler):
         shape = x.shape[1:]
         last = _ANNEALED_TO * step.noise
         levels = -(-self.steps // _STEPS_PER_LEVEL)
-        rhos = np.geomspace(max(self.largest, last), last, levels)
+        rhos = np.geomspace(max(_ANNEALED_FROM, last), last, levels)
         z = step.coupling(x, rhos[0], streams).draw(x, streams.normal(*shape))
         velocity = streams.normal(*shape)
         kept = math.exp(-_FRICTION * _STEP)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -16,11 +16,31 @@ from probmotion.samplers.conditional.base import (
     VarianceExploding,
 )
 from probmotion.samplers.diffusion.guidance import LinearObservations
+from probmotion.samplers.diffusion.integrators import MAX_RATIO
 from probmotion.samplers.diffusion.noise_levels import AnyLevels, Karras
 from probmotion.seeds import NormalStreams
 from probmotion.validation import check_count
 
-__all__ = ["TwistedDiffusion"]
+__all__ = ["Particles", "TwistedDiffusion"]
+
+
+class Particles(NamedTuple):
+    """Weighted particles of B systems.
+
+    ``estimate`` and ``guided`` are D and D given y, (B P, L, J, 3); ``log_twist`` and
+    ``log_weights`` are (B, P). Weights include the twisting function.
+    """
+
+    estimate: np.ndarray
+    guided: np.ndarray
+    log_twist: np.ndarray
+    log_weights: np.ndarray
+
+    def chosen(self, streams: NormalStreams) -> np.ndarray:
+        """Return D given y of one particle of each system, chosen by weight, (B, L, J, 3)."""
+        B, P = self.log_weights.shape
+        last = _resampled(self.log_weights, streams)[:, 0]
+        return self.guided.reshape(B, P, *self.guided.shape[1:])[np.arange(B), last]
 
 
 @dataclass(frozen=True)
@@ -66,6 +86,32 @@ class TwistedDiffusion(AnnealedSampler):
         streams: NormalStreams,
         tick: Callable[[], Any],
     ) -> np.ndarray:
+        particles = self.filtered(pools, observations, shape, sigmas, streams, tick)
+        estimate, log_twist = particles.estimate, particles.log_twist
+        B, P = log_twist.shape
+        residual = observations.target - observations.observe(estimate)
+        square = (observations.precision[..., None] * residual**2).sum(axis=(1, 2, 3, 4))
+        log_weights = particles.log_weights - log_twist - 0.5 * square.reshape(B, P)
+        last = _resampled(log_weights, streams)[:, 0]
+        tick()
+        return estimate.reshape(B, P, *shape)[np.arange(B), last]
+
+    def filtered(
+        self,
+        pools: list[VarianceExploding],
+        observations: LinearObservations,
+        shape: tuple[int, ...],
+        sigmas: np.ndarray,
+        streams: NormalStreams,
+        tick: Callable[[], Any],
+        *,
+        second_order: bool = False,
+    ) -> Particles:
+        """Return the particles at the last noise level; ``tick`` is called after every other.
+
+        With ``second_order``, estimates are extrapolated from those of two levels (Lu et al. 2022),
+        for the prior's steps and for the proposals.
+        """
         B, P = len(streams.generators), self.particles
         rows = np.arange(B)[:, None]
 
@@ -82,15 +128,25 @@ class TwistedDiffusion(AnnealedSampler):
         x = sigmas[0] * fresh()
         estimate, guided, log_twist = twisted(x, 0)
         log_weights = log_twist
+        earlier: tuple[np.ndarray, np.ndarray] | None = None
         for level, (now, after) in enumerate(pairwise(sigmas), start=1):
             chosen = _resampled(log_weights, streams)
             flat = (rows * P + chosen).reshape(-1)
             x, estimate, guided = x[flat], estimate[flat], guided[flat]
+            parts = guided, estimate
+            if second_order:
+                if earlier is not None:
+                    growth = math.log(now / after) / math.log(sigmas[level - 2] / now)
+                    parts = tuple(
+                        part + 0.5 * min(growth, MAX_RATIO) * (part - past[flat])
+                        for part, past in zip(parts, earlier, strict=True)
+                    )
+                earlier = guided, estimate
             before = log_twist[rows, chosen]
             share = (after / now) ** 2
             deviation = after * math.sqrt(1 - share)
             noise = fresh()
-            mean, target = (part + share * (x - part) for part in (guided, estimate))
+            mean, target = (part + share * (x - part) for part in parts)
             x = mean + deviation * noise
             estimate, guided, log_twist = twisted(x, level)
             # log p(x_{t−1} | x_t) − log p̃(x_{t−1} | x_t, y), both of the same variance.
@@ -98,12 +154,7 @@ class TwistedDiffusion(AnnealedSampler):
             ratio = 0.5 * (proposed - (((x - target) / deviation) ** 2).sum(axis=(1, 2, 3)))
             log_weights = ratio.reshape(B, P) + log_twist - before
             tick()
-        residual = observations.target - observations.observe(estimate)
-        square = (observations.precision[..., None] * residual**2).sum(axis=(1, 2, 3, 4))
-        log_weights = log_weights - log_twist - 0.5 * square.reshape(B, P)
-        last = _resampled(log_weights, streams)[:, 0]
-        tick()
-        return estimate.reshape(B, P, *shape)[np.arange(B), last]
+        return Particles(estimate, guided, log_twist, log_weights)
 
 
 def _resampled(log_weights: np.ndarray, streams: NormalStreams) -> np.ndarray:

@@ -20,7 +20,7 @@ from probmotion.samplers.diffusion.states import State
 
 __all__ = ["DDIM", "DDPM", "AnyIntegrator", "Heun", "SecondOrderSDE", "Transition"]
 
-_MAX_RATIO = 2.0  # of consecutive steps, beyond which extrapolation is limited
+MAX_RATIO = 2.0  # of consecutive steps, beyond which extrapolation is limited
 
 
 class Transition(NamedTuple):
@@ -80,7 +80,7 @@ class SecondOrderSDE:
         if before is not None and t > 1:
             now = math.log(schedule.sigma(t) / schedule.sigma(t - 1))
             earlier = math.log(schedule.sigma(t + 1) / schedule.sigma(t))
-            combined = estimate + 0.5 * min(now / earlier, _MAX_RATIO) * (estimate - before)
+            combined = estimate + 0.5 * min(now / earlier, MAX_RATIO) * (estimate - before)
         return Transition(estimate, combined, step.noisy, step.clean, step.deviation)
 
 

@@ -72,7 +72,7 @@ def test_one_posterior_many_samplers(tmp_path, monkeypatch):
     assert set(wide.index) == {"exact", "ancestral3d", "mas", "mvpc", "split-gibbs", "mh"}
     assert 0.9 < wide.loc["ancestral3d", "off_manifold_ratio"] < 1.1
     assert wide.loc["ancestral3d", "mode_proportions_tv"] > 0.3
-    assert wide.loc["split-gibbs", "mode_proportions_tv"] > 0.3
+    assert 0.2 < wide.loc["split-gibbs", "mode_proportions_tv"] < 0.4
     assert wide.loc["mas", "variance_ratio"] > 1.5
     assert wide.loc["mvpc", "swd_ratio"] < wide.loc["mas", "swd_ratio"]
     evaluations = wide["denoiser_evaluations"]

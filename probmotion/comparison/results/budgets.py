@@ -197,7 +197,7 @@ def _settings(sampler: Sampler, effort: int) -> dict[str, int]:
     scaled = {}
     for name in others:
         value = getattr(sampler, name)
-        scaled[name] = max(min(value, 1), round(value * effort / given))
+        scaled[name] = max(min(value, 1), round(value * effort / given)) if given else value
     return {first: effort, **scaled}
 
 

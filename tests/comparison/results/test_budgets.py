@@ -14,7 +14,7 @@ from probmotion.comparison import Budget, Comparison, compare
 from probmotion.comparison.results.budgets import affordable, effort_of
 from probmotion.files import read_json, write_json
 from probmotion.posteriors.sampling import load_sampler, sampler_names
-from probmotion.samplers import MetropolisHastings, MultiViewAncestral
+from probmotion.samplers import MetropolisHastings, MultiViewAncestral, SplitGibbs
 
 
 class Pilot:
@@ -47,6 +47,25 @@ def test_other_effort_settings_are_scaled_in_proportion():
     assert settings == {"stride": 30, "start": 150}
     assert affordable(Budget(evaluations=25), Walking(stride=20, start=3), pilot)["start"] == 1
     assert affordable(Budget(evaluations=25), Walking(stride=20, start=0), pilot)["start"] == 0
+
+
+@pytest.mark.parametrize("amount", [150, 592, 1184])
+def test_budgets_determine_the_particles_of_split_gibbs(amount):
+    def pilot(sampler):
+        return sampler.start_steps * sampler.particles + sampler.steps
+
+    settings = affordable(Budget(evaluations=amount), SplitGibbs(), pilot)
+    assert settings["particles"] == round(settings["steps"] / 50)
+    # The number of particles is rounded, and so is the cost.
+    assert pilot(SplitGibbs(**settings)) == pytest.approx(amount, rel=0.1)
+
+
+def test_efforts_of_zero_keep_other_settings():
+    def pilot(sampler):
+        return sampler.particles
+
+    sampler = SplitGibbs(steps=0)
+    assert affordable(Budget(evaluations=8), sampler, pilot) == {"steps": 0, "particles": 8}
 
 
 def test_a_budget_below_the_least_effort_is_unsupported():

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from probmotion import Cameras, Keypoints2D, Motion, MotionPosterior
-from probmotion.samplers.conditional import SplitGibbs, z_steps
+from probmotion.samplers.conditional import SplitGibbs, twisted, z_steps
 from probmotion.samplers.conditional.coupling import Coupling, Quadratic
 from probmotion.samplers.diffusion.guidance import LinearObservations
 from probmotion.seeds import NormalStreams
 
 DRAWS = 1500
+SWEPT = 3000
 
 
 @pytest.fixture(scope="module")
@@ -49,15 +50,44 @@ def test_draws_are_exact_with_several_cameras(gaussian, keypoints, assert_covari
     assert_exact(SplitGibbs(steps=60, sweeps=6), gaussian, seen, assert_covariance)
 
 
-def test_without_subtraction_draws_are_not_exact(
-    gaussian, keypoints, assert_covariance, monkeypatch
-):
-    def unsplit(likelihood, rho, gains):
-        return Coupling(likelihood, rho)
+class SharedGenerator(NormalStreams):
+    """Streams of a batch from its first generator, which takes less time."""
 
-    monkeypatch.setattr(z_steps, "Coupling", unsplit)
-    with pytest.raises(AssertionError):
-        assert_exact(SplitGibbs(steps=60, sweeps=6), gaussian, keypoints, assert_covariance)
+    def _filled(self, method, size):
+        return getattr(self.generators[0], method)(size)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
+@pytest.mark.parametrize("subtracted", [True, False])
+def test_sweeps_leave_the_posterior_invariant(
+    gaussian, keypoints, assert_covariance, monkeypatch, share, subtracted
+):
+    """Exact draws remain exact in 30 sweeps, and not without the subtraction of ρ²."""
+    if not subtracted:
+        monkeypatch.setattr(
+            z_steps, "Coupling", lambda likelihood, rho, gains: Coupling(likelihood, rho)
+        )
+    mean, covariance = gaussian.posterior(keypoints)
+    rng, posterior = np.random.default_rng(3), MotionPosterior(gaussian, keypoints)
+    x = rng.normal(size=(SWEPT, 12)) @ np.linalg.cholesky(covariance).T
+    x = mean + x.reshape(SWEPT, *mean.shape)
+    sampler = SplitGibbs(sweeps=30, inner_steps=12, share=share)
+    pools = sampler._pools(posterior)
+    step, _ = sampler._step(posterior, pools[0])
+    streams = SharedGenerator([rng] * SWEPT)
+    x = gaussian.scale * sampler._sweep(pools, step, x / gaussian.scale, streams, lambda: None)
+    # The expected log likelihood is that of the mean, less half of the number of directions that
+    # the observations determine.
+    determined = 12 - np.trace(np.linalg.solve(gaussian.covariance, covariance))
+    log_density = keypoints.log_density(x)
+    error = log_density.mean() - keypoints.log_density(mean) + 0.5 * determined
+    deviations = abs(error) / (log_density.std() / np.sqrt(SWEPT))
+    if subtracted:
+        assert deviations < 4
+        assert_covariance(x - mean, covariance)
+        assert (abs(x.mean(axis=0) - mean).ravel() < 5 * np.sqrt(np.diag(covariance) / SWEPT)).all()
+    else:
+        assert deviations > 4
 
 
 def test_reverse_diffusion_draws_from_the_conditional(gaussian, assert_covariance):
@@ -104,6 +134,28 @@ def test_scores_are_those_of_the_marginal(gaussian, keypoints):
         assert score[index] == pytest.approx(slope, rel=1e-5, abs=1e-5)
 
 
+@pytest.mark.parametrize("weighted", [True, False])
+def test_modes_have_the_probabilities_of_the_posterior(mixture, monkeypatch, weighted):
+    """Three modes have these from many weighted starts, and not from starts without weights."""
+    if not weighted:
+        monkeypatch.setattr(
+            twisted,
+            "_resampled",
+            lambda weights, streams: np.broadcast_to(np.arange(weights.shape[1]), weights.shape),
+        )
+    truth = Motion(mixture.sample(np.random.default_rng(4), 1)[0], mixture.skeleton, mixture.fps)
+    hidden = np.array([[[False, False], [True, True]]])
+    seen = Keypoints2D.observe(truth, Cameras.ring(1, elevation=0.3), 0.3, seed=0, hidden=hidden)
+    exact = mixture.exact_posterior(seen).component_probabilities
+    assert (np.sort(exact, axis=None)[-3:] > 0.15).all()
+    particles = 64 if weighted else 2
+    sampler = SplitGibbs(steps=0, sweeps=1, particles=particles)
+    drawn = sampler.sample(MotionPosterior(mixture, seen), draws=300, progress=False).flat()
+    found = mixture._metres.responsibilities(drawn.reshape(300, -1)).mean(axis=0)
+    distance = 0.5 * np.abs(found - exact).sum()
+    assert (distance < 0.15) == weighted
+
+
 @pytest.mark.parametrize("denoiser", ["3d", "2d"])
 def test_draws_do_not_depend_on_the_batch(gaussian, keypoints, denoiser):
     posterior = MotionPosterior(gaussian, keypoints)
@@ -128,5 +180,5 @@ def test_wrong_settings():
         SplitGibbs(share=1.2)
     with pytest.raises(ValueError, match="inner_steps must be an integer of at least 2, got 1"):
         SplitGibbs(inner_steps=1)
-    with pytest.raises(ValueError, match="largest must be a finite number above 0, got 0"):
-        SplitGibbs(largest=0.0)
+    with pytest.raises(ValueError, match="particles must be an integer of at least 2, got 1"):
+        SplitGibbs(particles=1)

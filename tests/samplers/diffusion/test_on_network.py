@@ -18,6 +18,7 @@ from probmotion.models.training.trainer import train
 from probmotion.motion.motion import KeypointTrack
 from probmotion.motion.skeleton import Skeleton
 from probmotion.samplers import MultiViewAncestral, MultiViewPredictorCorrector, ScoreDistillation
+from probmotion.samplers.conditional.split_gibbs import SplitGibbs
 from probmotion.samplers.diffusion.ancestral2d import Ancestral2D
 from probmotion.samplers.diffusion.guidance import (
     DPS,
@@ -118,19 +119,27 @@ def test_single_views(prior):
     np.testing.assert_array_equal(single, views)
 
 
+def label(sampler):
+    guidance = getattr(sampler, "guidance", None)
+    return sampler.name if guidance is None else f"{sampler.name}-{guidance.kind}"
+
+
 GUIDED = [
     *(
         MultiViewAncestral(steps=15, levels=Cosine(trained_steps=100), guidance=guidance)
         for guidance in (MomentMatched(), Replacement(), WeightedTriangulation(20.0), DPS(0.5))
     ),
     MultiViewPredictorCorrector(steps=15),
+    SplitGibbs(steps=10, sweeps=2),
 ]
 
 
 @pytest.mark.parametrize("kind", ["keypoints", "joints"])
-@pytest.mark.parametrize("sampler", GUIDED, ids=lambda s: f"{s.name}-{s.guidance.kind}")
+@pytest.mark.parametrize("sampler", GUIDED, ids=label)
 def test_guided_draws_are_closer_to_the_observations(prior, sampler, kind):
-    truth = draw(sampler, prior, draws=1, seed=9)[0]
+    # Split Gibbs sampling requires observations.
+    free = MultiViewPredictorCorrector(steps=15) if isinstance(sampler, SplitGibbs) else sampler
+    truth = draw(free, prior, draws=1, seed=9)[0]
     cameras = Cameras.around([0.3], [0.1])
     project = cameras.project if kind == "keypoints" else np.asarray
     likelihood = Joints3D(truth, noise=0.02)
@@ -138,11 +147,12 @@ def test_guided_draws_are_closer_to_the_observations(prior, sampler, kind):
         likelihood = Keypoints2D(cameras.project(truth), cameras, noise=0.02)
     unguided, guided = (
         np.sqrt(np.mean([(project(motion) - project(truth)) ** 2 for motion in motions]))
-        for motions in (draw(sampler, prior, given, seed=1) for given in (None, likelihood))
+        for motions in (draw(free, prior, seed=1), draw(sampler, prior, likelihood, seed=1))
     )
     assert guided < 0.7 * unguided
 
 
+OBSERVED = Joints3D(np.zeros((10, 4, 3)), noise=0.1)
 SAMPLERS = [
     MultiViewAncestral(steps=6),
     MultiViewAncestral(steps=6, perspective=True),
@@ -152,10 +162,11 @@ SAMPLERS = [
 ]
 
 
-@pytest.mark.parametrize("sampler", SAMPLERS)
+@pytest.mark.parametrize("sampler", [*SAMPLERS, SplitGibbs(steps=10, sweeps=2)])
 def test_draws_are_bit_identical_for_any_batch(prior, sampler):
-    motions = draw(sampler, prior, draws=13)
-    batched = draw(replace(sampler, batch=5), prior, draws=13)
+    likelihood = OBSERVED if isinstance(sampler, SplitGibbs) else None
+    motions = draw(sampler, prior, likelihood, draws=13)
+    batched = draw(replace(sampler, batch=5), prior, likelihood, draws=13)
     np.testing.assert_array_equal(batched, motions)
 
 
