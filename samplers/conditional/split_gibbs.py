@@ -149,7 +149,7 @@ class SplitGibbs(ConditionalSampler):
 
         def draw(streams: NormalStreams, tick: Callable[[], Any]) -> np.ndarray:
             particles = start.filtered(
-                pools, observations, shape, start.sigmas, streams, tick, second_order=one_pool
+                pools, observations, shape, streams, tick, second_order=one_pool
             )
             x = self._anneal(pools, step, particles.chosen(streams), streams, tick)
             return self._sweep(pools, step, x, streams, tick)

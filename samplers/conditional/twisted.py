@@ -86,7 +86,7 @@ class TwistedDiffusion(AnnealedSampler):
         streams: NormalStreams,
         tick: Callable[[], Any],
     ) -> np.ndarray:
-        particles = self.filtered(pools, observations, shape, sigmas, streams, tick)
+        particles = self.filtered(pools, observations, shape, streams, tick)
         estimate, log_twist = particles.estimate, particles.log_twist
         B, P = log_twist.shape
         residual = observations.target - observations.observe(estimate)
@@ -101,7 +101,6 @@ class TwistedDiffusion(AnnealedSampler):
         pools: list[VarianceExploding],
         observations: LinearObservations,
         shape: tuple[int, ...],
-        sigmas: np.ndarray,
         streams: NormalStreams,
         tick: Callable[[], Any],
         *,
@@ -112,7 +111,7 @@ class TwistedDiffusion(AnnealedSampler):
         With ``second_order``, estimates are extrapolated from those of two levels (Lu et al. 2022),
         for the prior's steps and for the proposals.
         """
-        B, P = len(streams.generators), self.particles
+        B, P, sigmas = len(streams.generators), self.particles, self.sigmas
         rows = np.arange(B)[:, None]
 
         def fresh() -> np.ndarray:

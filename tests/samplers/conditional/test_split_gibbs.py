@@ -182,3 +182,14 @@ def test_wrong_settings():
         SplitGibbs(inner_steps=1)
     with pytest.raises(ValueError, match="particles must be an integer of at least 2, got 1"):
         SplitGibbs(particles=1)
+
+
+def test_particles_are_chosen_by_their_weights():
+    systems = 4000
+    weights = np.log([0.1, 0.7, 0.2])
+    guided = np.tile(np.arange(3.0), systems).reshape(-1, 1, 1, 1)
+    log_weights = np.tile(weights + 5.0, (systems, 1))
+    particles = twisted.Particles(guided, guided, log_weights, log_weights)
+    chosen = particles.chosen(NormalStreams.of_draws(0, [(0, i) for i in range(systems)]))
+    shares = np.bincount(chosen.reshape(-1).astype(int), minlength=3) / systems
+    np.testing.assert_allclose(shares, np.exp(weights), atol=4 * np.sqrt(0.25 / systems))
