@@ -3,7 +3,7 @@
     python notebooks/ablations/mas.py --out mas
     python notebooks/ablations/mas.py --quick --out quick    (synthetic walks, tiny networks, 1 min)
 
-``--parts`` selects table, tracks, strided and exact. The package includes the networks of walk2d; the
+``--parts`` selects table, tracks, conditioned, times and exact. The package includes the networks of walk2d; the
 lifter is trained here on the same tracks. Draws are stored in ``--out/comparisons``, views of the
 2D model and lifted motions in ``--out/motions``; run the same command again to resume an
 interrupted study. Clips are read from ``--data``, by default ../shared/data of the repository.
@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from scipy.special import logit
 
 from probmotion import seeds
 from probmotion.comparison import Comparison, compare
@@ -44,6 +45,7 @@ from probmotion.models.evaluation.lifter_training import LifterTrainee
 from probmotion.models.evaluation.pose_flow import FlowSettings, PoseFlow
 from probmotion.models.evaluation.pose_flow_training import PoseFlowTrainee
 from probmotion.models.evaluation.track_autoencoder import EvaluatorSettings
+from probmotion.models.mixture.spectral_mixture import SpectralMixtureMotion
 from probmotion.models.training.settings import TrainingSettings
 from probmotion.models.training.track_batches import Augmentation
 from probmotion.models.training.trainer import train
@@ -53,17 +55,24 @@ from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
 from probmotion.plots.generation import draw_generation
 from probmotion.plots.skeletons import draw_skeletons
+from probmotion.posteriors.likelihoods import Keypoints2D
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.problem import Problem
 from probmotion.posteriors.sampling import Sampler
 from probmotion.problems import load_problem
-from probmotion.samplers import MultiViewAncestral, MultiViewPredictorCorrector, ScoreDistillation
+from probmotion.samplers import (
+    ExactSampler,
+    MultiViewAncestral,
+    MultiViewPredictorCorrector,
+    ScoreDistillation,
+    SplitGibbs,
+)
 from probmotion.samplers.diffusion.ancestral2d import Ancestral2D
-from probmotion.samplers.diffusion.integrators import DDPM, SecondOrderSDE
-from probmotion.samplers.diffusion.noise_levels import Cosine
+from probmotion.samplers.diffusion.noise_levels import Karras, LogSNR
 
 SEED = 0
 FPS = 20.0
+OBSERVED_NOISE = 0.02  # of the keypoints of conditioned draws, metres
 PERSON = Skeleton.preset("person14")
 SHOWN = {
     "fid": "FID, held-out clips",
@@ -193,12 +202,13 @@ class Study:
         part: str,
         problems: Mapping[str, Problem | MotionPosterior],
         samplers: Mapping[str, Sampler],
+        draws: int | None = None,
     ) -> Comparison:
         """Return the comparison of a part; stored runs are reused."""
         return compare(
             problems,
             samplers,
-            draws=self.draws,
+            draws=draws or self.draws,
             chains=1,
             out=self.out / "comparisons" / part,
             workers=0,
@@ -385,20 +395,25 @@ def lifters(study: Study) -> Mapping[str, PoseLifter | Predictions | Flat]:
     return named
 
 
+def track_prior(study: Study, components: int) -> SpectralMixtureMotion:
+    """Return the spectral mixture learnt by EM from the 2D tracks of training."""
+    filming = Filming()
+    return motion_prior_from_tracks(
+        study.tracks.train,
+        study.frames,
+        components=components,
+        elevations=(filming.elevation - filming.tilt, filming.elevation + filming.tilt),
+        distance=filming.distance,
+    )
+
+
 def tracks(study: Study) -> pd.DataFrame:
     """Return the metrics of draws of spectral mixtures learnt by EM from the same 2D tracks."""
-    filming, real = Filming(), study.motions("test")
-    elevations = (filming.elevation - filming.tilt, filming.elevation + filming.tilt)
+    real = study.motions("test")
     rows = []
     for components in (1, 8):
         start = time.perf_counter()
-        prior = motion_prior_from_tracks(
-            study.tracks.train,
-            study.frames,
-            components=components,
-            elevations=elevations,
-            distance=filming.distance,
-        )
+        prior = track_prior(study, components)
         fitted = time.perf_counter()
         drawn = prior.sample(seeds.generator(SEED, "tracks"), study.draws)
         seconds = (time.perf_counter() - fitted) / study.draws
@@ -409,31 +424,89 @@ def tracks(study: Study) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def strided(study: Study) -> pd.DataFrame:
-    """Return the metrics of MAS and mvpc by number of noise levels and integrator."""
-    real = study.motions("test")
-    defaults = {
-        "MAS": MultiViewAncestral(perspective=True),
-        "mvpc": MultiViewPredictorCorrector.learnt(),
+def conditioned(study: Study) -> pd.DataFrame:
+    """Return the errors of motions given keypoints of one camera, of held-out clips."""
+    clips, rng = study.motions("test"), seeds.generator(SEED, "observed")
+    posteriors: dict[str, dict[str, MotionPosterior]] = {"network": {}, "spectral": {}}
+    truths = {}
+    priors = {"network": study.prior, "spectral": track_prior(study, components=8)}
+    for number, chosen in enumerate(
+        rng.choice(len(clips), 4 if study.quick else 24, replace=False)
+    ):
+        camera = Cameras.around([rng.uniform(0, 2 * math.pi)], [study.prior.view_elevation])
+        truths[name := f"sequence-{number}"] = clips[chosen]
+        observed = Keypoints2D.observe(
+            Motion(clips[chosen], PERSON, FPS), camera, noise=OBSERVED_NOISE, seed=number
+        )
+        for kind, prior in priors.items():
+            posteriors[kind][name] = MotionPosterior(prior, observed)
+    methods: dict[str, dict[str, Sampler]] = {
+        "network": {
+            "MAS": MultiViewAncestral(),
+            "mvpc": MultiViewPredictorCorrector.learnt(),
+            "split-gibbs": SplitGibbs(),
+        },
+        "spectral": {"exact": ExactSampler()},
     }
-    integrators = {"first order": DDPM(), "second order": SecondOrderSDE()}
-    levels = Cosine(trained_steps=100)
-    variants: dict[tuple[str, int, str], Sampler] = {
-        (name, steps, order): replace(sampler, steps=steps, levels=levels, integrator=integrator)
-        for name, sampler in defaults.items()
-        for steps in (20, 50, 100)
-        for order, integrator in integrators.items()
-    }
-    labelled = {
-        f"{name}, {order}, {steps} steps": sampler
-        for (name, steps, order), sampler in variants.items()
-    }
-    comparison = study.compared("strided", {"walks": study.problem}, labelled)
     rows = []
-    for (name, steps, order), run in zip(variants, comparison.results, strict=True):
-        row = score_run(study, name, comparison, run, real)
-        rows.append({"steps": steps, "order": order, **row})
-        print(rows[-1], flush=True)
+    for kind, samplers in methods.items():
+        comparison = study.compared(f"conditioned-{kind}", posteriors[kind], samplers, draws=16)
+        for sampler in samplers:
+            runs = [run for run in comparison.results if run.sampler == sampler]
+            failed = [str(run.failure) for run in runs if run.failure is not None]
+            row: dict[str, object] = {"prior": kind, "sampler": sampler, "failed": len(failed)}
+            if not failed:
+                errors = pd.DataFrame(
+                    errors_of(comparison.draws(run.problem, sampler).flat(), truths[run.problem])
+                    for run in runs
+                )
+                row |= dict(errors.mean()) | dict(errors.sem().add_suffix("_se"))
+            rows.append(row)
+            print(rows[-1], flush=True)
+    return pd.DataFrame(rows)
+
+
+def errors_of(draws: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+    """Return the mean joint error of the mean and of draws, mm, and the coverage of intervals."""
+    low, high = np.quantile(draws, [0.05, 0.95], axis=0)
+    return {
+        "mean_mm": 1000 * float(np.linalg.norm(draws.mean(axis=0) - truth, axis=-1).mean()),
+        "draws_mm": 1000 * float(np.linalg.norm(draws - truth, axis=-1).mean()),
+        "contained": float(((truth >= low) & (truth <= high)).mean()),
+    }
+
+
+def times(study: Study) -> pd.DataFrame:
+    """Return errors of denoised views between trained levels: at fractional or nearest times."""
+    views = study.views("test", 100)[:, None]
+    prior, camera = study.prior, Cameras.around([0.0], [study.prior.view_elevation])
+    clean, trained = views / prior.scale, prior.settings.schedule.alpha_bar[1:]
+    rows = []
+    for levels in (Karras(smallest=0.026), LogSNR(smallest=0.026)):
+        difference = np.zeros(len(views))
+        error = np.zeros(len(views))
+        schedule = levels.schedule(50)
+        for number, alpha_bar in enumerate(schedule.alpha_bar[1:]):
+            noise = seeds.generator(SEED, f"times/{number}").standard_normal(clean.shape)
+            noisy = math.sqrt(alpha_bar) * clean + math.sqrt(1 - alpha_bar) * noise
+            near = trained[abs(logit(trained) - logit(alpha_bar)).argmin()]
+            # The network at the nearest trained level sees a signal of that level's strength.
+            moved = noisy * math.sqrt(near / alpha_bar)
+            each = [
+                np.linalg.norm(prior.denoise(x, at, camera) - clean, axis=-1).mean(axis=(1, 2, 3))
+                for x, at in ((noisy, alpha_bar), (moved, near))
+            ]
+            error += each[0] / schedule.steps
+            difference += (each[1] - each[0]) / schedule.steps
+        millimetres = 1000 * prior.scale
+        rows.append(
+            {
+                "levels": levels.kind,
+                "error_mm": millimetres * error.mean(),
+                "nearest_minus_fractional_mm": millimetres * difference.mean(),
+                "nearest_minus_fractional_se": millimetres * difference.std() / len(views) ** 0.5,
+            }
+        )
     return pd.DataFrame(rows)
 
 
@@ -494,7 +567,13 @@ def exact(study: Study) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-PARTS = {"table": table, "tracks": tracks, "strided": strided, "exact": exact}
+PARTS = {
+    "table": table,
+    "tracks": tracks,
+    "conditioned": conditioned,
+    "times": times,
+    "exact": exact,
+}
 
 
 def main() -> None:

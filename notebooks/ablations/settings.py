@@ -18,8 +18,12 @@ from typing import Any, ClassVar
 import numpy as np
 
 from probmotion.comparison import compare
+from probmotion.models.diffusion.motion_diffusion import MotionDiffusion
+from probmotion.models.evaluation.evaluator import TrackEvaluator
 from probmotion.posteriors.posterior import MotionPosterior
+from probmotion.posteriors.problem import Problem
 from probmotion.posteriors.sampling import Sampler
+from probmotion.problems import load_problem
 from probmotion.samplers import (
     NUTS,
     Ancestral3D,
@@ -143,20 +147,25 @@ STUDIES = {
         },
     ),
     "network": Study(
-        "integrators and levels on a network",
+        "levels and integrators of a network trained on 100 levels",
         ("walk2d",),
         {
-            "mas": MultiViewAncestral(),
-            "mas, 20 second-order levels": MultiViewAncestral(
-                steps=20, levels=Cosine(trained_steps=100), integrator=SecondOrderSDE()
+            **{
+                f"{name}, {steps} levels, {integrator.kind}": replace(
+                    sampler, steps=steps, levels=Cosine(trained_steps=100), integrator=integrator
+                )
+                for name, sampler in {
+                    "mas": MultiViewAncestral(perspective=True),
+                    "mvpc": MultiViewPredictorCorrector.learnt(),
+                }.items()
+                for steps in (20, 50, 100)
+                for integrator in (DDPM(), SecondOrderSDE(), Heun())
+            },
+            # Levels between those of training.
+            "mas, 100 levels, karras": MultiViewAncestral(
+                perspective=True, levels=Karras(smallest=0.026), integrator=SecondOrderSDE()
             ),
-            "mvpc, learnt": MultiViewPredictorCorrector.learnt(),
-            "mvpc, second order": replace(
-                MultiViewPredictorCorrector.learnt(),
-                levels=Cosine(trained_steps=100),
-                integrator=SecondOrderSDE(),
-            ),
-            "mvpc, 58 levels": MultiViewPredictorCorrector(steps=58),
+            "mvpc, 97 levels, karras": MultiViewPredictorCorrector(),
         },
     ),
     "conditioning": Study(
@@ -232,6 +241,20 @@ STUDIES = {
 }
 
 
+def on_device(name: str, device: str) -> str | Problem:
+    """Return a problem with its networks on a device; only walk2d has networks."""
+    if name != "walk2d" or device == "cpu":
+        return name
+    problem = load_problem(name)
+    prior = MotionDiffusion.load(name, device=device)
+    evaluator = TrackEvaluator.load(f"{name}-evaluator", device=device)
+    return replace(
+        problem,
+        posterior=replace(problem.posterior, prior=prior),
+        generation=replace(problem.generation, evaluator=evaluator),
+    )
+
+
 def main() -> None:
     """Run the selected studies and print their tables."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
@@ -245,12 +268,14 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=100, help="Number of draws per run.")
     parser.add_argument("--seeds", type=int, default=3, help="Number of seeds.")
     parser.add_argument("--workers", type=int, default=2, help="Number of processes.")
+    parser.add_argument("--device", default="cpu", help="Device of networks: cpu, cuda or auto.")
     options = parser.parse_args()
     for name in options.studies:
         study = STUDIES[name]
         wanted = options.samplers or ""
+        problems = [each for each in study.problems if each in (options.problems or study.problems)]
         comparison = compare(
-            [each for each in study.problems if each in (options.problems or study.problems)],
+            [on_device(each, options.device) for each in problems],
             {each: sampler for each, sampler in study.samplers.items() if wanted in each},
             draws=options.draws,
             chains=4,
