@@ -58,6 +58,7 @@ from probmotion.plots.skeletons import draw_skeletons
 from probmotion.posteriors.likelihoods import Keypoints2D
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.problem import Problem
+from probmotion.posteriors.protocols import MotionPrior
 from probmotion.posteriors.sampling import Sampler
 from probmotion.problems import load_problem
 from probmotion.samplers import (
@@ -95,6 +96,8 @@ class Study:
     iterations: int
     repeats: int
     steps: int
+    device: str
+    workers: int
     predictions: Path | None = None
 
     @cached_property
@@ -134,7 +137,7 @@ class Study:
     def prior(self) -> MotionDiffusion:
         """The 2D motion diffusion model."""
         if not self.quick:
-            return MotionDiffusion.load("walk2d")
+            return MotionDiffusion.load("walk2d", device=self.device)
         size = DiffusionSettings.tiny(20)
         trainee = DiffusionTrainee(self.tracks.train, self.tracks.validation, size)
         settings = TrainingSettings(steps=600, batch=32, learning_rate=2e-3, ema=0.99)
@@ -211,7 +214,7 @@ class Study:
             draws=draws or self.draws,
             chains=1,
             out=self.out / "comparisons" / part,
-            workers=0,
+            workers=self.workers,
             progress=not self.quick,
         )
 
@@ -427,42 +430,44 @@ def tracks(study: Study) -> pd.DataFrame:
 def conditioned(study: Study) -> pd.DataFrame:
     """Return the errors of motions given keypoints of one camera, of held-out clips."""
     clips, rng = study.motions("test"), seeds.generator(SEED, "observed")
-    posteriors: dict[str, dict[str, MotionPosterior]] = {"network": {}, "spectral": {}}
-    truths = {}
-    priors = {"network": study.prior, "spectral": track_prior(study, components=8)}
-    for number, chosen in enumerate(
-        rng.choice(len(clips), 4 if study.quick else 24, replace=False)
-    ):
-        camera = Cameras.around([rng.uniform(0, 2 * math.pi)], [study.prior.view_elevation])
-        truths[name := f"sequence-{number}"] = clips[chosen]
-        observed = Keypoints2D.observe(
-            Motion(clips[chosen], PERSON, FPS), camera, noise=OBSERVED_NOISE, seed=number
+    chosen = rng.choice(len(clips), 4 if study.quick else 12, replace=False)
+    truths = {f"sequence-{number}": clips[row] for number, row in enumerate(chosen)}
+    azimuths = rng.uniform(0, 2 * math.pi, len(chosen))
+    observed = {
+        name: Keypoints2D.observe(
+            Motion(truth, PERSON, FPS),
+            Cameras.around([azimuths[number]], [study.prior.view_elevation]),
+            noise=OBSERVED_NOISE,
+            seed=number,
         )
-        for kind, prior in priors.items():
-            posteriors[kind][name] = MotionPosterior(prior, observed)
-    methods: dict[str, dict[str, Sampler]] = {
-        "network": {
-            "MAS": MultiViewAncestral(),
-            "mvpc": MultiViewPredictorCorrector.learnt(),
-            "split-gibbs": SplitGibbs(),
-        },
-        "spectral": {"exact": ExactSampler()},
+        for number, (name, truth) in enumerate(truths.items())
+    }
+    network: dict[str, Sampler] = {
+        "MAS": MultiViewAncestral(),
+        "mvpc": MultiViewPredictorCorrector.learnt(),
+        "split-gibbs": SplitGibbs(),
+    }
+    methods: dict[str, tuple[Callable[[], MotionPrior], dict[str, Sampler]]] = {
+        "network": (lambda: study.prior, network),
+        "spectral": (lambda: track_prior(study, components=8), {"exact": ExactSampler()}),
     }
     rows = []
-    for kind, samplers in methods.items():
-        comparison = study.compared(f"conditioned-{kind}", posteriors[kind], samplers, draws=16)
+    for kind, (make_prior, samplers) in methods.items():
+        prior = make_prior()
+        posteriors = {name: MotionPosterior(prior, seen) for name, seen in observed.items()}
+        comparison = study.compared(f"conditioned-{kind}", posteriors, samplers, draws=16)
         for sampler in samplers:
             runs = [run for run in comparison.results if run.sampler == sampler]
-            failed = [str(run.failure) for run in runs if run.failure is not None]
-            row: dict[str, object] = {"prior": kind, "sampler": sampler, "failed": len(failed)}
-            if not failed:
+            failures = [str(run.failure) for run in runs if run.failure is not None]
+            row: dict[str, object] = {"prior": kind, "sampler": sampler, "failed": len(failures)}
+            if not failures:
                 errors = pd.DataFrame(
                     errors_of(comparison.draws(run.problem, sampler).flat(), truths[run.problem])
                     for run in runs
                 )
                 row |= dict(errors.mean()) | dict(errors.sem().add_suffix("_se"))
             rows.append(row)
-            print(rows[-1], flush=True)
+            print(row, flush=True)
     return pd.DataFrame(rows)
 
 
@@ -588,6 +593,10 @@ def main() -> None:
     parser.add_argument("--draws", type=int, help="Number of motions per sampler.")
     parser.add_argument("--iterations", type=int, help="Iterations of SDS.")
     parser.add_argument("--steps", type=int, default=4000, help="Training steps of networks.")
+    parser.add_argument(
+        "--device", default="cpu", help="Of the diffusion model: cpu, cuda or auto."
+    )
+    parser.add_argument("--workers", type=int, default=0, help="Number of processes.")
     parser.add_argument("--predictions", type=Path, help="Motions of an external lifter, npz.")
     options = parser.parse_args()
     study = Study(
@@ -598,6 +607,8 @@ def main() -> None:
         iterations=options.iterations or (50 if options.quick else 10_000),
         repeats=10,
         steps=options.steps,
+        device=options.device,
+        workers=options.workers,
         predictions=options.predictions,
     )
     options.out.mkdir(parents=True, exist_ok=True)
