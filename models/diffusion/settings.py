@@ -108,6 +108,8 @@ class DiffusionSettings(TransformerSettings):
     def level(self, alpha_bar: float) -> float:
         """Return the fractional index of the noise level ᾱ, interpolated in log noise.
 
+        Below the first level of training, the index is between 0 and 1.
+
         Raises
         ------
         ValueError

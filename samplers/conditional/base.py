@@ -12,7 +12,12 @@ from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.protocols import Denoises2D, Denoises3D
 from probmotion.posteriors.sampling import UnsupportedPosterior, suited
 from probmotion.samplers.diffusion import views
-from probmotion.samplers.diffusion.guidance import LinearObservations, MomentMatched, can_guide
+from probmotion.samplers.diffusion.guidance import (
+    LinearisedObservations,
+    LinearObservations,
+    MomentMatched,
+    can_guide,
+)
 from probmotion.samplers.diffusion.noise_levels import NoiseLevels
 from probmotion.samplers.diffusion.views import MotionDenoiser, StateDenoiser, view_sets
 from probmotion.samplers.independent import Batches, IndependentSampler
@@ -35,7 +40,11 @@ class VarianceExploding:
         return self.denoiser.denoise(math.sqrt(alpha_bar) * y, alpha_bar)
 
     def condition(
-        self, observations: LinearObservations, y: np.ndarray, sigma: float, estimate: np.ndarray
+        self,
+        observations: LinearObservations | LinearisedObservations,
+        y: np.ndarray,
+        sigma: float,
+        estimate: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the moment-matched conditional mean and the squared residual, (B,)."""
         alpha_bar = 1 / (1 + sigma**2)

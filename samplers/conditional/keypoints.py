@@ -14,6 +14,7 @@ from scipy.special import gammainc, gammaincinv
 from probmotion.geometry.cameras import Cameras
 from probmotion.posteriors.likelihoods import Joints3D, Keypoints2D
 from probmotion.samplers.conditional.coupling import Quadratic
+from probmotion.samplers.diffusion.guidance import LinearisedObservations
 from probmotion.seeds import NormalStreams
 
 __all__ = ["Linearised", "Observations"]
@@ -116,6 +117,12 @@ class Observations:
         turned = cameras.rotation[:, :2] - image[..., None] * cameras.rotation[:, None, 2]
         axes = (self._scale * cameras.focal[:, None, None]) * turned / depth[..., None]
         return Linearised(residual, axes.reshape(*shape, -1, 3))
+
+    def about(self, x: np.ndarray) -> LinearisedObservations:
+        """Return the observations linearised about motions x, with Gaussian noise."""
+        local = self.linearise(x)
+        target = local.residual[..., None] + local.axes @ x[..., None]
+        return LinearisedObservations(local.axes, target, self.precision)
 
     def in_front(self, x: np.ndarray) -> np.ndarray:
         """Return whether joints are in front of the cameras that see them, (B, L, J)."""

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -40,7 +40,12 @@ from probmotion.samplers.conditional.keypoints import Observations
 from probmotion.samplers.conditional.twisted import TwistedDiffusion
 from probmotion.samplers.conditional.z_steps import GaussianStep, MetropolisStep, ZStep
 from probmotion.samplers.diffusion.ancestral import reverse_diffusion
-from probmotion.samplers.diffusion.guidance import MomentMatched, can_guide, guide_towards
+from probmotion.samplers.diffusion.guidance import (
+    LinearObservations,
+    MomentMatched,
+    can_guide,
+    require_covariance,
+)
 from probmotion.samplers.diffusion.integrators import SecondOrderSDE
 from probmotion.samplers.diffusion.noise_levels import Karras
 from probmotion.samplers.diffusion.states import MotionState
@@ -140,9 +145,8 @@ class SplitGibbs(ConditionalSampler):
                 others=suited(posterior),
             )
         pools = self._pools(posterior, self.n_views, self.elevation, rings=_RINGS)
-        step, linear = self._step(posterior, pools[0])
-        observations = self._observations(linear)
-        guide_towards(self, linear, MomentMatched(), pools[0].denoiser)  # or raise an error
+        step, observations = self._step(posterior, pools[0])
+        require_covariance(self, posterior, MomentMatched(), pools[0].denoiser)
         start = TwistedDiffusion(steps=self.start_steps, particles=self.particles, levels=_START)
         shape = (posterior.frames, posterior.skeleton.n_joints, 3)
         one_pool = len(pools) == 1  # estimates of different pools do not extrapolate
@@ -161,10 +165,11 @@ class SplitGibbs(ConditionalSampler):
 
     def _step(
         self, posterior: MotionPosterior, clean: VarianceExploding
-    ) -> tuple[ZStep, MotionPosterior]:
-        """Return the step of z, and the linear Gaussian posterior of the start."""
-        if can_guide(posterior):
-            return GaussianStep(Quadratic.of(self._observations(posterior))), posterior
+    ) -> tuple[ZStep, LinearObservations | Observations]:
+        """Return the step of z, and the observations that guide the start."""
+        if can_guide(posterior) or posterior.likelihood is None:
+            linear = self._observations(posterior)
+            return GaussianStep(Quadratic.of(linear)), linear
         likelihood, prior = posterior.likelihood, posterior.prior
         assert isinstance(likelihood, Keypoints2D | Joints3D)
         self._check_observed(likelihood.entries.precision)
@@ -172,15 +177,8 @@ class SplitGibbs(ConditionalSampler):
         # At high noise, the estimate is the mean of the prior.
         blank = np.zeros((1, posterior.frames, posterior.skeleton.n_joints, 3))
         centre = clean(blank, _PRIOR).mean(axis=(0, 1, 2))
-        step = MetropolisStep(Observations(likelihood, scale, centre), centre)
-        linear = replace(likelihood, degrees_of_freedom=None)
-        if isinstance(linear, Keypoints2D):
-            cameras = linear.cameras
-            if not cameras.orthographic:
-                depth = cameras.depth(scale * centre[None, None])[:, 0, 0]
-                cameras = replace(cameras, focal=cameras.focal / depth, orthographic=True)
-            linear = replace(linear, cameras=cameras)
-        return step, _LinearPosterior(prior, linear)
+        observations = Observations(likelihood, scale, centre)
+        return MetropolisStep(observations, centre), observations
 
     def _anneal(
         self,
@@ -248,10 +246,3 @@ class SplitGibbs(ConditionalSampler):
         state = MotionState([clean.denoiser], schedule, z.shape[1:])
         x = math.sqrt(schedule.alpha_bar[-1]) * z
         return reverse_diffusion(state, streams, x, lambda: None, SecondOrderSDE())
-
-
-class _LinearPosterior(MotionPosterior):
-    """Posterior of linearised observations, whose outliers the prior does not reject."""
-
-    def __post_init__(self) -> None:
-        pass

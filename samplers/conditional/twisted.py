@@ -15,6 +15,7 @@ from probmotion.samplers.conditional.base import (
     DenoiserChoice,
     VarianceExploding,
 )
+from probmotion.samplers.conditional.keypoints import Observations
 from probmotion.samplers.diffusion.guidance import LinearObservations
 from probmotion.samplers.diffusion.integrators import MAX_RATIO
 from probmotion.samplers.diffusion.noise_levels import AnyLevels, Karras
@@ -99,7 +100,7 @@ class TwistedDiffusion(AnnealedSampler):
     def filtered(
         self,
         pools: list[VarianceExploding],
-        observations: LinearObservations,
+        observations: LinearObservations | Observations,
         shape: tuple[int, ...],
         streams: NormalStreams,
         tick: Callable[[], Any],
@@ -121,7 +122,8 @@ class TwistedDiffusion(AnnealedSampler):
             """Return D, D given y, and the log twisting function, (B, P)."""
             clean, sigma = pools[level % len(pools)], sigmas[level]
             estimate = clean(x, sigma)
-            guided, square = clean.condition(observations, x, sigma, estimate)
+            local = observations.about(estimate)
+            guided, square = clean.condition(local, x, sigma, estimate)
             return estimate, guided, -0.5 * square.reshape(B, P)
 
         x = sigmas[0] * fresh()

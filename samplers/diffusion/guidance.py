@@ -19,8 +19,8 @@ from probmotion.samplers.diffusion.views import StateDenoiser, symmetric_power
 from probmotion.validation import check_count, check_positive
 
 __all__ = [
-    "DPS", "AnyGuidance", "Guide", "MomentMatched", "Replacement", "WeightedTriangulation",
-    "can_guide", "guide_towards",
+    "DPS", "AnyGuidance", "Guide", "LinearObservations", "LinearisedObservations", "MomentMatched",
+    "Replacement", "WeightedTriangulation", "can_guide", "guide_towards", "require_covariance",
 ]  # fmt: skip
 
 Guide = Callable[[np.ndarray, float, np.ndarray, PosteriorStep], np.ndarray]
@@ -76,6 +76,10 @@ class LinearObservations:
         top = self.precision.max(initial=0.0)
         return self.precision / top if top > 0 else self.precision
 
+    def about(self, motions: np.ndarray) -> LinearObservations:
+        """Return the observations linearised about motions, which are these."""
+        return self
+
     def observe(self, motions: np.ndarray) -> np.ndarray:
         """Return A X: ``(B, L, J, 3) → (B, V, L, J, M)``."""
         return motions[:, None] @ self.axes.swapaxes(1, 2)[:, None]
@@ -87,6 +91,27 @@ class LinearObservations:
     def information(self, weight: np.ndarray) -> np.ndarray:
         """Return Σ_v w A_vᵀ A_v: ``(V, L, J) → (L, J, 3, 3)``."""
         return np.einsum("vlj,vmx,vmy->ljxy", weight, self.axes, self.axes)
+
+
+@dataclass(frozen=True)
+class LinearisedObservations:
+    """Observations of B motions, linearised about each, in normalised units.
+
+    ``axes``, (…, K, 3), are the Jacobians of the K rows of an entry; ``target`` is y − π(X) + A X,
+    (B, L, J, K, 1); ``precision`` is W, (L, J, K), 0 for missing entries.
+    """
+
+    axes: np.ndarray
+    target: np.ndarray
+    precision: np.ndarray
+
+    def observe(self, motions: np.ndarray) -> np.ndarray:
+        """Return A X: ``(B, L, J, 3) → (B, L, J, K, 1)``."""
+        return self.axes @ motions[..., None]
+
+    def adjoint(self, entries: np.ndarray) -> np.ndarray:
+        """Return Aᵀ u: ``(B, L, J, K, 1) → (B, L, J, 3)``."""
+        return (self.axes.swapaxes(-1, -2) @ entries)[..., 0]
 
 
 @dataclass(frozen=True)
@@ -123,7 +148,7 @@ class MomentMatched:
 
     def condition(
         self,
-        observations: LinearObservations,
+        observations: LinearObservations | LinearisedObservations,
         denoiser: StateDenoiser,
         x_t: np.ndarray,
         alpha_bar: float,
@@ -259,15 +284,26 @@ def guide_towards(
     if posterior.likelihood is None:
         return None
     observations = LinearObservations.of(sampler, posterior)
+    if isinstance(guidance, MomentMatched | DPS):
+        require_covariance(sampler, posterior, guidance, denoiser)
+    return guidance.prepare(observations, denoiser)
+
+
+def require_covariance(
+    sampler: Sampler,
+    posterior: MotionPosterior,
+    guidance: MomentMatched | DPS,
+    denoiser: StateDenoiser,
+) -> None:
+    """Raise :class:`UnsupportedPosterior` unless the prior has the covariance of the denoiser."""
     protocol = denoiser.covariance_protocol
-    if isinstance(guidance, MomentMatched | DPS) and not isinstance(posterior.prior, protocol):
+    if not isinstance(posterior.prior, protocol):
         raise UnsupportedPosterior(
             sampler.name,
             f"with guidance {guidance.kind} requires a prior that implements {protocol.__name__}, "
             f"got {type(posterior.prior).__name__}; use replacement or weighted-triangulation",
             word=protocol.__name__,
         )
-    return guidance.prepare(observations, denoiser)
 
 
 def conjugate_gradients(
