@@ -161,7 +161,7 @@ STUDIES = {
                 for steps in (20, 50, 100)
                 for integrator in (DDPM(), SecondOrderSDE(), Heun())
             },
-            # Levels between those of training.
+            # Levels that are not those of training.
             "mas, 100 levels, karras": MultiViewAncestral(
                 perspective=True, levels=Karras(smallest=0.026), integrator=SecondOrderSDE()
             ),

@@ -114,7 +114,9 @@ class Observations:
         residual = self._target - (cameras.focal[:, None] * image + cameras.centre).reshape(
             *shape, -1
         )
-        turned = cameras.rotation[:, :2] - image[..., None] * cameras.rotation[:, None, 2]
+        # The smallest depth does not change with x.
+        free = (depth > self._nearest[:, None])[..., None]
+        turned = cameras.rotation[:, :2] - free * image[..., None] * cameras.rotation[:, None, 2]
         axes = (self._scale * cameras.focal[:, None, None]) * turned / depth[..., None]
         return Linearised(residual, axes.reshape(*shape, -1, 3))
 

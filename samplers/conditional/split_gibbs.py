@@ -29,6 +29,7 @@ import numpy as np
 
 from probmotion.posteriors.likelihoods import Joints3D, Keypoints2D
 from probmotion.posteriors.posterior import MotionPosterior
+from probmotion.posteriors.protocols import DenoiserCovariance2D, DenoiserCovariance3D
 from probmotion.posteriors.sampling import UnsupportedPosterior, suited
 from probmotion.samplers.conditional.base import (
     ConditionalSampler,
@@ -42,9 +43,7 @@ from probmotion.samplers.conditional.z_steps import GaussianStep, MetropolisStep
 from probmotion.samplers.diffusion.ancestral import reverse_diffusion
 from probmotion.samplers.diffusion.guidance import (
     LinearObservations,
-    MomentMatched,
     can_guide,
-    require_covariance,
 )
 from probmotion.samplers.diffusion.integrators import SecondOrderSDE
 from probmotion.samplers.diffusion.noise_levels import Karras
@@ -100,6 +99,10 @@ class SplitGibbs(ConditionalSampler):
     """
 
     name: ClassVar[str] = "split-gibbs"
+    requires: ClassVar[tuple[Any, ...]] = (
+        *ConditionalSampler.requires,
+        DenoiserCovariance3D | DenoiserCovariance2D,
+    )
     effort: ClassVar[tuple[str, ...]] = ("steps", "particles")
 
     steps: int = 400
@@ -146,7 +149,6 @@ class SplitGibbs(ConditionalSampler):
             )
         pools = self._pools(posterior, self.n_views, self.elevation, rings=_RINGS)
         step, observations = self._step(posterior, pools[0])
-        require_covariance(self, posterior, MomentMatched(), pools[0].denoiser)
         start = TwistedDiffusion(steps=self.start_steps, particles=self.particles, levels=_START)
         shape = (posterior.frames, posterior.skeleton.n_joints, 3)
         one_pool = len(pools) == 1  # estimates of different pools do not extrapolate
@@ -167,7 +169,7 @@ class SplitGibbs(ConditionalSampler):
         self, posterior: MotionPosterior, clean: VarianceExploding
     ) -> tuple[ZStep, LinearObservations | Observations]:
         """Return the step of z, and the observations that guide the start."""
-        if can_guide(posterior) or posterior.likelihood is None:
+        if can_guide(posterior):
             linear = self._observations(posterior)
             return GaussianStep(Quadratic.of(linear)), linear
         likelihood, prior = posterior.likelihood, posterior.prior

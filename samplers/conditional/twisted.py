@@ -10,6 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from probmotion.posteriors.protocols import DenoiserCovariance2D, DenoiserCovariance3D
 from probmotion.samplers.conditional.base import (
     AnnealedSampler,
     DenoiserChoice,
@@ -67,6 +68,10 @@ class TwistedDiffusion(AnnealedSampler):
     """
 
     name: ClassVar[str] = "tds"
+    requires: ClassVar[tuple[Any, ...]] = (
+        *AnnealedSampler.requires,
+        DenoiserCovariance3D | DenoiserCovariance2D,
+    )
 
     steps: int = 50
     particles: int = 8

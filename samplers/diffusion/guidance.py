@@ -20,7 +20,7 @@ from probmotion.validation import check_count, check_positive
 
 __all__ = [
     "DPS", "AnyGuidance", "Guide", "LinearObservations", "LinearisedObservations", "MomentMatched",
-    "Replacement", "WeightedTriangulation", "can_guide", "guide_towards", "require_covariance",
+    "Replacement", "WeightedTriangulation", "can_guide", "guide_towards",
 ]  # fmt: skip
 
 Guide = Callable[[np.ndarray, float, np.ndarray, PosteriorStep], np.ndarray]
@@ -77,7 +77,7 @@ class LinearObservations:
         return self.precision / top if top > 0 else self.precision
 
     def about(self, motions: np.ndarray) -> LinearObservations:
-        """Return the observations linearised about motions, which are these."""
+        """Return ``self``, as the observations are linear."""
         return self
 
     def observe(self, motions: np.ndarray) -> np.ndarray:
@@ -93,7 +93,7 @@ class LinearObservations:
         return np.einsum("vlj,vmx,vmy->ljxy", weight, self.axes, self.axes)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LinearisedObservations:
     """Observations of B motions, linearised about each, in normalised units.
 
@@ -284,26 +284,15 @@ def guide_towards(
     if posterior.likelihood is None:
         return None
     observations = LinearObservations.of(sampler, posterior)
-    if isinstance(guidance, MomentMatched | DPS):
-        require_covariance(sampler, posterior, guidance, denoiser)
-    return guidance.prepare(observations, denoiser)
-
-
-def require_covariance(
-    sampler: Sampler,
-    posterior: MotionPosterior,
-    guidance: MomentMatched | DPS,
-    denoiser: StateDenoiser,
-) -> None:
-    """Raise :class:`UnsupportedPosterior` unless the prior has the covariance of the denoiser."""
     protocol = denoiser.covariance_protocol
-    if not isinstance(posterior.prior, protocol):
+    if isinstance(guidance, MomentMatched | DPS) and not isinstance(posterior.prior, protocol):
         raise UnsupportedPosterior(
             sampler.name,
             f"with guidance {guidance.kind} requires a prior that implements {protocol.__name__}, "
             f"got {type(posterior.prior).__name__}; use replacement or weighted-triangulation",
             word=protocol.__name__,
         )
+    return guidance.prepare(observations, denoiser)
 
 
 def conjugate_gradients(

@@ -20,8 +20,10 @@ from probmotion.posteriors.likelihoods import LinearObservation
 from probmotion.posteriors.sampling import suited
 from probmotion.problems import load_problem
 from probmotion.samplers.conditional import SplitGibbs
+from probmotion.samplers.conditional.base import VarianceExploding
 from probmotion.samplers.conditional.keypoints import Observations
 from probmotion.samplers.conditional.z_steps import Auxiliary, MetropolisStep
+from probmotion.samplers.diffusion.views import MotionDenoiser
 from probmotion.seeds import NormalStreams
 
 DRAWS = 1500
@@ -147,6 +149,32 @@ def test_linearisation(keypoints, gaussian, cases, perspective):
         change[index] = 1e-6
         above, below = (likelihood.log_density(scale * (x + s * change)) for s in (1, -1))
         np.testing.assert_allclose(slope[:, *index], (above - below) / 2e-6, rtol=1e-5, atol=1e-5)
+
+
+def test_guidance_by_distant_cameras_is_that_of_orthographic_ones(keypoints, gaussian, cases):
+    """Guided estimates and weights, with two cameras and a hidden joint."""
+    clean = VarianceExploding(MotionDenoiser(gaussian))
+    x = cases(keypoints(), n=3)[1]
+    results = []
+    for likelihood in (keypoints(1e5), keypoints(perspective=False)):
+        posterior = MotionPosterior(gaussian, likelihood)
+        estimate = clean(x, 0.3)
+        _, observations = SplitGibbs()._step(posterior, clean)
+        results.append(clean.condition(observations.about(estimate), x, 0.3, estimate))
+    for (ours, theirs), change in zip(zip(*results, strict=True), (x, 1.0), strict=True):
+        assert abs(ours - change).max() > 0.1
+        np.testing.assert_allclose(ours, theirs, rtol=1e-3, atol=1e-3)
+
+
+def test_joints_behind_a_camera_do_not_move_with_depth(keypoints, cases):
+    step, x, _ = cases(keypoints(3.0), n=2)
+    x = x - 100 * step._observations._cameras.rotation[0, 2]
+    assert not step._observations.in_front(x).any()
+    local = step._observations.linearise(x)
+    for axis, change in enumerate(1e-6 * np.eye(3)):
+        moved = step._observations.linearise(x + change).residual
+        slope = (local.residual - moved) / 1e-6
+        np.testing.assert_allclose(local.axes[..., axis], slope, rtol=1e-4, atol=1e-4)
 
 
 def test_proposals_of_linear_observations_are_exact(keypoints, truth, cases):
