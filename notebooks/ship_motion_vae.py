@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from ship_walk2d import write_features
+from ship_diffusion import write_features
 
 from probmotion.data.projections import Filming, centre_motion
 from probmotion.data.synthetic.animals import ANIMAL_SKELETON, animal_clips

@@ -50,9 +50,10 @@ def test_wheel_contains_every_module_and_nothing_else(wheel):
         if path.suffix in (".py", ".pyi")
     }
     data = {
-        "py.typed", "data/registry.csv", "plots/animation.css", "plots/animation.js",
-        "plots/picture.js", "reconstruction/surface.js", "report/copy.js", "report/page.css",
-        "report/tables.js", "comparison/measured.csv", "comparison/measured.json",
+        "py.typed", "data/person_clips.csv", "data/registry.csv", "plots/animation.css",
+        "plots/animation.js", "plots/picture.js", "reconstruction/surface.js", "report/copy.js",
+        "report/page.css", "report/tables.js", "comparison/measured.csv",
+        "comparison/measured.json",
     }  # fmt: skip
     data |= {
         f"problems/references/{name}/{file}"
@@ -60,15 +61,14 @@ def test_wheel_contains_every_module_and_nothing_else(wheel):
         for file in ("draws.npz", "certificate.json")
     }
     weights = [
-        "joint_limits.npz", "walk2d.md", "walk2d.safetensors", "walk2d-evaluator.safetensors",
-        "walk2d-features.npz", "body-dvae.md", "body-dvae.safetensors",
+        "joint_limits.npz", "body-dvae.md", "body-dvae.safetensors",
         "body-dvae-denoiser.safetensors", "cmu-motion.md", "cmu-motion.npz",
         "cmu-motion-coco17.md", "cmu-motion-coco17.npz", "salsa-pairs.md", "salsa-pairs.npz",
         "pose-depth.md", "pose-depth.npz",
     ]  # fmt: skip
     weights += [
         f"{name}{ending}"
-        for name in ("walk-vae", "animal-vae")
+        for name in ("walk2d", "motion2d", "walk-vae", "animal-vae")
         for ending in (".md", ".safetensors", "-evaluator.safetensors", "-features.npz")
     ]
     weights += [

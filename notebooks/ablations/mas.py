@@ -3,10 +3,11 @@
     python notebooks/ablations/mas.py --out mas
     python notebooks/ablations/mas.py --quick --out quick    (synthetic walks, tiny networks, 1 min)
 
-``--parts`` selects table, tracks, conditioned, times and exact. The package includes the networks of walk2d; the
-lifter is trained here on the same tracks. Draws are stored in ``--out/comparisons``, views of the
-2D model and lifted motions in ``--out/motions``; run the same command again to resume an
-interrupted study. Clips are read from ``--data``, by default ../shared/data of the repository.
+``--parts`` selects table, sets, tracks, conditioned, times and exact; ``--prior`` the prior, walk2d
+or motion2d, whose networks are part of the package. The lifter is trained here on the same tracks.
+Draws are stored in ``--out/comparisons``, views of the 2D model and lifted motions in
+``--out/motions``; run the same command again to resume an interrupted study. Clips are read from
+``--data``, by default ../shared/data of the repository.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from probmotion import seeds
 from probmotion.comparison import Comparison, compare
 from probmotion.comparison.results.fingerprint import fingerprint
 from probmotion.comparison.results.run_results import RunResult
+from probmotion.data.person_clips import moving_clips
 from probmotion.data.projections import DetectorNoise, Filming, centre_motion, project_clips
 from probmotion.data.synthetic.walks import synthetic_walks, walk_clips
 from probmotion.data.tracks.learning import LearningTracks, film_clips, film_windows, split_tracks
@@ -72,6 +74,7 @@ from probmotion.samplers.diffusion.ancestral2d import Ancestral2D
 from probmotion.samplers.diffusion.noise_levels import Karras, LogSNR
 
 SEED = 0
+SETS = {"2D model": 3, "MAS": 1, "mvpc": 1}  # numbers of sets of draws for the model card
 FPS = 20.0
 OBSERVED_NOISE = 0.02  # of the keypoints of conditioned draws, metres
 PERSON = Skeleton.preset("person14")
@@ -98,6 +101,7 @@ class Study:
     steps: int
     device: str
     workers: int
+    name: str
     predictions: Path | None = None
 
     @cached_property
@@ -106,7 +110,7 @@ class Study:
         if self.quick:
             walks = synthetic_walks(24, seconds=4)
             return {"train": walks[:16], "validation": walks[16:18], "test": walks[18:]}
-        return walk_clips(self.data)
+        return walk_clips(self.data) if self.name == "walk2d" else moving_clips(self.data)
 
     @cached_property
     def tracks(self) -> LearningTracks:
@@ -129,7 +133,9 @@ class Study:
             centre_motion(clip.retarget(PERSON).resample(FPS)).positions
             for clip in self.clips[part]
         ]
-        straight = np.concatenate([windows(clip, self.frames) for clip in clips])
+        # Runs of motion2d are shorter than its motions.
+        long = [clip for clip in clips if len(clip) >= self.frames]
+        straight = np.concatenate([windows(clip, self.frames) for clip in long])
         mirrored = straight[:, :, list(PERSON.mirrored_order)] * np.array([-1.0, 1.0, 1.0])
         return np.concatenate([straight, mirrored])
 
@@ -137,7 +143,7 @@ class Study:
     def prior(self) -> MotionDiffusion:
         """The 2D motion diffusion model."""
         if not self.quick:
-            return MotionDiffusion.load("walk2d", device=self.device)
+            return MotionDiffusion.load(self.name, device=self.device)
         size = DiffusionSettings.tiny(20)
         trainee = DiffusionTrainee(self.tracks.train, self.tracks.validation, size)
         settings = TrainingSettings(steps=600, batch=32, learning_rate=2e-3, ema=0.99)
@@ -147,7 +153,7 @@ class Study:
     def reference(self) -> GenerationReference:
         """Held-out real 2D motion and the evaluator network for its features."""
         if not self.quick:
-            reference = load_problem("walk2d").generation
+            reference = load_problem(self.name).generation
             assert reference is not None
             return reference
         trainee = EvaluatorTrainee(
@@ -163,7 +169,7 @@ class Study:
         """The problem that samplers draw from."""
         return Problem(
             "walks",
-            "walking people, diffusion prior learnt from 2D tracks alone: generation",
+            "people who move, diffusion prior learnt from 2D tracks alone: generation",
             MotionPosterior(self.prior),
             generation=replace(self.reference, held_out_views=self.views("test", 400)),
         )
@@ -250,17 +256,8 @@ def table(study: Study) -> pd.DataFrame:
         rows.append(score(study, name, motions, views, real, seconds))
         print(rows[-1], flush=True)
 
-    # Ten times as many windows as draws, so that each repeat has different ones.
-    add("held-out clips, 2D", None, study.views("test", 10 * study.draws, seed=3), math.nan)
-    add("truth, 2D", None, study.views("train", 10 * study.draws, seed=3), math.nan)
-    rng = seeds.generator(SEED, "truth")
-    shown = study.motions("train")
-    shown = shown[rng.choice(len(shown), study.draws)]
-    # Clips have one heading, draws have random headings.
-    rotated = [
-        Motion(clip, PERSON, FPS).turned(rng.uniform(0, 2 * math.pi)).positions for clip in shown
-    ]
-    add("truth, 3D", np.stack(rotated), None, math.nan)
+    for name, motions, views in true_motions(study):
+        add(name, motions, views, math.nan)
     views, seconds = study.once(
         "2D model",
         [Ancestral2D(), study.prior, study.draws],
@@ -294,6 +291,47 @@ def table(study: Study) -> pd.DataFrame:
     return table
 
 
+def true_motions(study: Study) -> list[tuple[str, np.ndarray | None, np.ndarray | None]]:
+    """Return names, 3D motions and 2D views of real motion."""
+    # Ten times as many windows as draws, so that each repeat has different ones.
+    views = {part: study.views(part, 10 * study.draws, seed=3) for part in ("test", "train")}
+    rng = seeds.generator(SEED, "truth")
+    shown = study.motions("train")
+    shown = shown[rng.choice(len(shown), study.draws)]
+    # Clips have one heading, draws have random headings.
+    rotated = [
+        Motion(clip, PERSON, FPS).turned(rng.uniform(0, 2 * math.pi)).positions for clip in shown
+    ]
+    return [
+        ("held-out clips, 2D", None, views["test"]),
+        ("truth, 2D", None, views["train"]),
+        ("truth, 3D", np.stack(rotated), None),
+    ]
+
+
+def sets(study: Study) -> pd.DataFrame:
+    """Return the metrics of sets of draws of the 2D model, MAS and mvpc, for the model card."""
+    posterior, real = study.problem.posterior, study.motions("test")
+    rows = [
+        score(study, name, motions, views, real, math.nan)
+        for name, motions, views in true_motions(study)
+    ]
+    options = {"draws": study.draws, "progress": False}
+    for name, count in SETS.items():
+        for seed in range(count):
+            start = time.perf_counter()
+            motions, views = None, None
+            if name == "2D model":
+                views = Ancestral2D().sample_views(posterior, seed=seed, **options)
+            else:
+                sampler = samplers(study.iterations)[name]
+                motions = sampler.sample(posterior, chains=1, seed=seed, **options).flat()
+            seconds = (time.perf_counter() - start) / study.draws
+            rows.append(score(study, name, motions, views, real, seconds))
+            print(rows[-1], flush=True)
+    return pd.DataFrame(rows)
+
+
 def score(
     study: Study,
     name: str,
@@ -309,6 +347,7 @@ def score(
     scores = {}
     if motions is None:
         assert views is not None
+        row["speed"] = smooth_speed(views)
         scores[""] = study.reference.score_views(views, **settings)
         scores["_learnt"] = study.reference.of_learnt().score_views(views, **settings)
     else:
@@ -330,6 +369,12 @@ def score(
             row |= {f"{metric}{suffix}": mean, f"{metric}{suffix}_sd": sd}
     row["collapsed"] = row["recall"] < COLLAPSED_BELOW
     return row
+
+
+def smooth_speed(views: np.ndarray) -> float:
+    """Return the mean speed of joints, m/s, in means over five frames, which remove most noise."""
+    smooth = np.mean([views[:, k : views.shape[1] - 4 + k] for k in range(5)], axis=0)
+    return float(np.linalg.norm(np.diff(smooth, axis=1), axis=-1).mean() * FPS)
 
 
 def score_run(
@@ -578,6 +623,7 @@ def exact(study: Study) -> pd.DataFrame:
 
 PARTS = {
     "table": table,
+    "sets": sets,
     "tracks": tracks,
     "conditioned": conditioned,
     "times": times,
@@ -602,6 +648,8 @@ def main() -> None:
     )
     parser.add_argument("--workers", type=int, default=0, help="Number of processes.")
     parser.add_argument("--predictions", type=Path, help="Motions of an external lifter, npz.")
+    priors = ("walk2d", "motion2d")
+    parser.add_argument("--prior", choices=priors, default=priors[0], help="Prior to draw from.")
     options = parser.parse_args()
     study = Study(
         out=options.out,
@@ -613,6 +661,7 @@ def main() -> None:
         steps=options.steps,
         device=options.device,
         workers=options.workers,
+        name=options.prior,
         predictions=options.predictions,
     )
     options.out.mkdir(parents=True, exist_ok=True)

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
+from probmotion.data.person_clips import clip_segments, on_person
 from probmotion.data.synthetic.gaits import GAITS, make_gait
-from probmotion.files import read_arrays
-from probmotion.io.files import load
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_count, check_positive
@@ -18,7 +14,6 @@ from probmotion.validation import check_count, check_positive
 __all__ = ["DENOISING_CLIPS", "denoising_clips", "synthetic_denoising_clips"]
 
 _FPS = 30.0
-_FRAMES = 30  # window length
 _HUMANOID_TRAINING = (
     "backflip", "cartwheel", "crawl", "dance_a", "dance_spin", "getup_facedown", "long_walk1",
     "long_walk2", "long_zombie", "punch", "roll", "sideflip", "spin", "spinkick", "stealthy_walk0",
@@ -65,12 +60,12 @@ def denoising_clips(
     ``FileNotFoundError`` if a file is missing, and ``ValueError`` if ``suspect`` is not one bool
     per frame.
     """
-    convert = _on_person if convert is None else convert
+    convert = on_person if convert is None else convert
     return {
         part: [
             segment
             for name in names
-            for segment in _segments(Path(folder) / f"{name}.npz", convert)
+            for segment in clip_segments(Path(folder) / f"{name}.npz", convert)
         ]
         for part, names in DENOISING_CLIPS.items()
     }
@@ -96,24 +91,3 @@ def synthetic_denoising_clips(
         clips.append(gait.retarget(skeleton))
     end = n + held_out
     return {"train": clips[:n], "validation": clips[n:end], "test": clips[end:]}
-
-
-def _on_person(motion: Motion) -> Motion:
-    return motion.retarget(Skeleton.preset("person14"))
-
-
-def _segments(path: Path, convert: Callable[[Motion], Motion]) -> list[Motion]:
-    """Return the segments between suspect frames that are at least a window long."""
-    motion = convert(load(path))
-    suspect = read_arrays(path).get("suspect", np.zeros(motion.frames, bool))
-    if suspect.dtype != bool or suspect.shape != (motion.frames,):
-        raise ValueError(
-            f"{path.name}: suspect must be bool of shape ({motion.frames},), got {suspect.dtype} "
-            f"of shape {suspect.shape}"
-        )
-    if not suspect.any():
-        return [motion.resample(_FPS)]
-    edges = np.flatnonzero(np.diff(suspect, prepend=True, append=True)).reshape(-1, 2).tolist()
-    segments = [motion.window(start, stop - start).resample(_FPS) for start, stop in edges]
-    long = [segment for segment in segments if segment.frames >= _FRAMES]
-    return [replace(segment, name=f"{motion.name}-{number}") for number, segment in enumerate(long)]

@@ -69,14 +69,13 @@ _FEWEST, _SHARE = 10, 0.1  # visible frames of the joints whose residuals are ch
 _LIMITS = {
     "noise": (0.04, "the keypoints' noise is more than 4 cm at the person's distance"),
     "residual": (1.6, "keypoints of a joint do not follow a body before a still camera"),
-    "unsteady": (0.5, "feet and body move to and fro together (does the camera move?)"),
+    "unsteady": (0.4, "feet and body move to and fro together (does the camera move?)"),
     "posture": (2.1, "the posture is unlike those from which the prior was learnt"),
     "surprise": (2.5, "the motion is unlike those from which the prior was learnt"),
     "proportions": (3.0, "the body has unusual proportions (another animal, swapped joints?)"),
     "mirrored": (
-        -10.0,
-        "the motion is not clearly more likely than with left and right exchanged (is the video "
-        "mirrored?)",
+        0.0,
+        "the motion is more likely with left and right exchanged (is the video mirrored?)",
     ),
 }
 

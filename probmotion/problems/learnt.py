@@ -74,6 +74,12 @@ LEARNT_PROBLEMS: Mapping[str, tuple[str, Callable[[], Problem]]] = {
         ),
         (
             learnt_problem,
+            "motion2d",
+            "walking, running and jumping, diffusion prior learnt from 2D tracks alone: generation",
+            "MotionDiffusion",
+        ),
+        (
+            learnt_problem,
             "walk-vae",
             "walking people, motion VAE learnt from 2D tracks alone: generation",
             "MotionVAE",

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from probmotion import Cameras, Keypoints2D, MotionPosterior, compare, models
+from probmotion.data.person_clips import clips_of_actions
 from probmotion.data.projections import centre_motion
 from probmotion.data.synthetic.animals import animal_clips, synthetic_animals
 from probmotion.data.synthetic.gaits import make_gaits
 from probmotion.data.synthetic.walks import synthetic_walks, walk_clips
 from probmotion.data.tracks.learning import film_windows
+from probmotion.metrics.generation import frechet_distance
 from probmotion.metrics.measures import measure
 from probmotion.models import MotionVAE
 from probmotion.models.vae.view_hypotheses import evaluate_hypotheses
@@ -21,9 +23,11 @@ from probmotion.motion.distances import mirrored_fraction, nearest_distances, wi
 from probmotion.posteriors.sampling import load_sampler
 from probmotion.problems import load_problem
 from probmotion.samplers import NUTS, MultiViewAncestral
+from probmotion.samplers.diffusion.ancestral2d import Ancestral2D
 from probmotion.samplers.diffusion.noise_levels import Cosine
 
 WEIGHTS = Path(models.__file__).parent / "weights"
+DIFFUSION = ("walk2d", "motion2d")
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +45,7 @@ def draws(problem):
     ("name", "words"),
     [
         ("walk2d", ("Training clips: cmu_02_01", "Test clips: humanoid3d_long_walk3", "NSF")),
+        ("motion2d", ("Training clips: cmu_01_01", "Test clips: cmu_02_02", "NSF", "Not for")),
         ("walk-vae", ("MIT licence", "correct depth", "Not for")),
         ("animal-vae", ("MIT licence", "correct depth", "Not for")),
     ],
@@ -57,9 +62,29 @@ def test_shipped_files_and_held_out_clips(name, words):
     network = problem.posterior.prior.card["network"]
     clips = {*network["data"]["clips"], *network["validation_data"]["clips"]}
     assert not clips & {"humanoid3d_long_walk3", "humanoid3d_stealthy_walk", "dog3d_trot"}
-    if name == "walk2d":
+    if name == "motion2d":
+        held_out = clips_of_actions("walking", "running", "jumping")["test"]
+        assert not clips & {clip.rpartition("/")[2] for clip in held_out}
+    if name in DIFFUSION:
         evaluator = problem.generation.evaluator.card["network"]
         assert network["data"]["clips"] == evaluator["data"]["clips"]
+
+
+@pytest.mark.parametrize("name", DIFFUSION)
+def test_2d_draws_are_almost_as_close_to_held_out_clips_as_training_clips(name):
+    """The Fréchet distance is at most 1.5 times that of as many views of the training clips."""
+    problem = load_problem(name)
+    views = Ancestral2D().sample_views(problem.posterior, draws=128, seed=0, progress=False)
+    reference = problem.generation
+    ours, training, smeared = (
+        frechet_distance(features, reference.held_out_features)
+        for features in (
+            reference.evaluator.features(views),
+            reference.learnt_features[:128],
+            reference.evaluator.features(0.5 * (views + views[::-1])),
+        )
+    )
+    assert ours < 1.5 * training < smeared
 
 
 def test_bones_are_rigid_with_correct_lengths(problem, draws):

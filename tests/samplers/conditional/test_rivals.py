@@ -137,7 +137,7 @@ def test_unsuitable_posteriors(gaussian, keypoints, minimal, sampler):
     heavy = replace(keypoints, degrees_of_freedom=4.0)
     with pytest.raises(UnsupportedPosterior, match="supports only linear Gaussian likelihoods"):
         sampler.sample(MotionPosterior(gaussian, heavy), draws=1, progress=False)
-    with pytest.raises(UnsupportedPosterior, match="Denoises3D or Denoises2D.*, got Minimal"):
+    with pytest.raises(UnsupportedPosterior, match=r"Denoises3D or Denoises2D.*, got Minimal"):
         sampler.sample(MotionPosterior(minimal()), draws=1)
     with pytest.raises(ValueError, match="denoiser must be one of any, 3d, 2d, got '4d'"):
         replace(sampler, denoiser="4d")
