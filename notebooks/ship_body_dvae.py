@@ -107,6 +107,8 @@ layers have width {size.hidden}.
   with funding from NSF EIA-0196217.
 - **Not for**: other skeletons, frame rates other than {prior.fps:g}, children and animals.
   Except for climbing and walking, an action has only one or two training clips.
+- **Compared with `cmu-motion`**: alone, this network is not better than the exact spectral prior and is
+  kept as the paper's method. It is used after `joint-corrector`, as a correction of spectral posteriors.
 
 | network | weights | steps | batch | seconds | loss (training / validation) |
 |---|---|---|---|---|---|

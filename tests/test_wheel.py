@@ -64,7 +64,7 @@ def test_wheel_contains_every_module_and_nothing_else(wheel):
         "joint_limits.npz", "body-dvae.md", "body-dvae.safetensors",
         "body-dvae-denoiser.safetensors", "cmu-motion.md", "cmu-motion.npz",
         "cmu-motion-coco17.md", "cmu-motion-coco17.npz", "salsa-pairs.md", "salsa-pairs.npz",
-        "pose-depth.md", "pose-depth.npz",
+        "pose-depth.md", "pose-depth.npz", "joint-corrector.md", "joint-corrector.safetensors",
     ]  # fmt: skip
     weights += [
         f"{name}{ending}"

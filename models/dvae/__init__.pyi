@@ -2,6 +2,7 @@ from .denoiser_training import (
     DenoiserTrainee as DenoiserTrainee,
     usual_denoiser_training as usual_denoiser_training,
 )
+from .joint_corrector import JointCorrector as JointCorrector
 from .joint_noise import JointNoise as JointNoise
 from .motion_denoiser import MotionDenoiser as MotionDenoiser
 from .motion_dvae import MotionDVAE as MotionDVAE

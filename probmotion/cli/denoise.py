@@ -46,8 +46,7 @@ class Denoise(Conventions):
     """Student-t noise with 3 degrees of freedom, for recordings with outliers."""
 
     correct: FlagCreatePairsOff[bool] = False
-    """Correct the mean with the network body-dvae (.1 s per frame, needs torch); for motion like
-    that of its training clips."""
+    """Correct mean and draws with networks (.1 s per frame, needs torch)."""
 
     draws: int = 20
     """Number of posterior draws."""
@@ -61,7 +60,6 @@ class Denoise(Conventions):
         from probmotion.io.files import read_joints
         from probmotion.models.mixture.denoising import denoise_joints
         from probmotion.motion.skeleton import Skeleton
-        from probmotion.problems.denoising import body_prior
         from probmotion.validation import check_count, check_positive
 
         if self.noise is not None:
@@ -77,7 +75,11 @@ class Denoise(Conventions):
         with errors_in(self.file):
             track = track.retarget(Skeleton.preset("person14"))
         writable_folder(self.out)
-        prior = body_prior() if self.correct else None  # fails before minutes of work
+        corrector = None
+        if self.correct:
+            from probmotion.problems.joint_correction import correct_joints, shipped_corrector
+
+            corrector = shipped_corrector()  # without torch, this fails before minutes of work
         result = denoise_joints(
             track.joints,
             None,
@@ -89,10 +91,8 @@ class Denoise(Conventions):
             seed=self.seed,
             progress=True,
         )
-        if self.correct:
-            from probmotion.problems.joint_correction import correct_joints
-
-            result = correct_joints(result, fps=track.fps, prior=prior, seed=self.seed)
+        if corrector is not None:
+            result = correct_joints(result, fps=track.fps, corrector=corrector, seed=self.seed)
         _write(track, result, self.out)
         print(_summary(track, result, self.file, self.noise is None))
         print(

@@ -105,8 +105,8 @@ def test_files_and_summary(calls, capsys, tmp_path):
 def test_the_mean_is_corrected_on_request(calls, monkeypatch, tmp_path):
     record(tmp_path / "walk.npz")
 
-    def correct_joints(found, *, fps, prior, seed):
-        assert prior.inference_network is not None
+    def correct_joints(found, *, fps, corrector, seed):
+        assert corrector.skeleton == PERSON
         assert (fps, seed) == (60.0, 5)
         return SimpleNamespace(**(vars(found) | {"mean": found.mean + 1}))
 

@@ -51,7 +51,9 @@ def errors(real_data):
             progress=False,
         )  # fmt: skip
         estimates |= {"spectral": found.mean}
-        estimates |= {"corrected": correct_joints(found, fps=truth.fps, progress=False).mean}
+        for name, iterations in (("corrected", 50), ("amortised", 0)):
+            result = correct_joints(found, fps=truth.fps, iterations=iterations, progress=False)
+            estimates[name] = result.mean
         for name, positions in estimates.items():
             error = accuracy.joint_errors(positions, truth.positions)
             errors.setdefault(name, []).append((error.mean(), error[hidden].mean()))
@@ -71,12 +73,19 @@ def test_optimisation_beats_filters_on_occluded_joints_and_is_on_par_on_all(erro
 
 
 def test_corrected_means_are_better_than_those_of_the_spectral_prior(errors):
-    # `accuracy.py learnt` has ratios of .93 and .88; these are six windows, which differ.
-    assert errors["corrected"][ALL] < 0.97 * errors["spectral"][ALL]
-    assert errors["corrected"][OCCLUDED] < 0.96 * errors["spectral"][OCCLUDED]
+    # `accuracy.py learnt` has ratios of .92 and .93 without optimisation, .89 and .86 with it;
+    # these are seven windows, which differ.
+    assert errors["amortised"][ALL] < 0.95 * errors["spectral"][ALL]
+    assert errors["corrected"][ALL] < 0.95 * errors["spectral"][ALL]
+    assert errors["corrected"][OCCLUDED] < 0.92 * errors["spectral"][OCCLUDED]
 
 
-@pytest.mark.xfail(strict=True, reason="29.5 mm against 30.8 mm; trained on half an hour of motion")
+def test_corrected_means_without_optimisation_beat_filters(errors):
+    assert errors["amortised"][ALL] < 0.9 * best_filter(errors, ALL)
+    assert errors["amortised"][OCCLUDED] < 0.9 * best_filter(errors, OCCLUDED)
+
+
+@pytest.mark.xfail(strict=True, reason="29.5 mm against 30.8 mm; trained on nine minutes of motion")
 def test_optimisation_beats_filters_on_all_joints(errors):
     assert errors["optimization"][ALL] < 0.9 * best_filter(errors, ALL)
 
