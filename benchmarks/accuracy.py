@@ -3,7 +3,7 @@
 Prints ``name: value`` lines. ``diffusion``: metrics of 400 draws (split Gibbs: 200, with 2D
 denoisers), mean over seeds.
 
-``learnt``: see :func:`learnt_figures`.
+``learnt``: see :func:`learnt_figures` and ``vae_figures.py``.
 
 ``images``, ``lift``, ``mixing``: see ``image_figures.py``, ``lift_figures.py``,
 ``mixing_figures.py``.
@@ -31,6 +31,7 @@ import numpy as np
 from image_figures import image_figures
 from lift_figures import lift_figures
 from mixing_figures import mixing_figures
+from vae_figures import vae_figures
 
 from probmotion import compare, seeds
 from probmotion.data.denoising_clips import denoising_clips
@@ -493,7 +494,8 @@ def main() -> None:
     elif options.command == "lift":
         figures = lift_figures(Path(options.data), options.lifter)
     elif options.command == "learnt":
-        figures = learnt_figures(Path(options.data))
+        folder = Path(options.data)
+        figures = itertools.chain(learnt_figures(folder), vae_figures(folder))
     elif options.command in ("diffusion", "mixing"):
         figures = diffusion_figures() if options.command == "diffusion" else mixing_figures()
     else:

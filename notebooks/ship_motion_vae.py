@@ -2,6 +2,7 @@
 
     python notebooks/ship_motion_vae.py walk-vae --runs runs
     python notebooks/ship_motion_vae.py animal-vae --runs runs
+    python notebooks/ship_motion_vae.py animal-vae --runs runs --third    (codes and encoder only)
 
 Run the command again to resume a stopped run. Networks are written to ``models/weights`` in half
 precision, with the evaluator and the features of held-out views. Clips are read from ``--data``, by
@@ -33,6 +34,7 @@ from probmotion.models.evaluation.track_autoencoder import EvaluatorSettings
 from probmotion.models.training.checkpoints import WEIGHTS, load_checkpoint
 from probmotion.models.training.settings import TrainingSettings
 from probmotion.models.training.trainer import train
+from probmotion.models.vae.code_fitting import with_learnt_codes
 from probmotion.models.vae.motion_vae import MotionVAE
 from probmotion.models.vae.settings import MotionVAESettings
 from probmotion.models.vae.training import MotionVAETrainee, PoseTrainee, usual_motion_vae_training
@@ -96,8 +98,14 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, default=Path("runs"), help="Folder of training runs.")
     data = ROOT.parent / "shared" / "data"
     parser.add_argument("--data", type=Path, default=data, help="Folder of the clips.")
+    text = "Learn only the codes and the encoder of the shipped networks again; keep the card."
+    parser.add_argument("--third", action="store_true", help=text)
     options = parser.parse_args()
     kind, folder = KINDS[options.name], options.runs / options.name
+    if options.third:
+        prior = with_third_phase(options.name, kind, options.data, folder)
+        prior.save(WEIGHTS / f"{options.name}.safetensors", half=True)
+        return
     clips = kind.clips(options.data)
     tracks = projected_tracks(kind, clips)
     prior = trained(kind, tracks, folder)
@@ -130,12 +138,27 @@ def trained(kind: Kind, tracks: dict[str, list[KeypointTrack]], folder: Path) ->
     size = replace(MotionVAESettings.small(), kl=kind.kl)
     body = ArticulatedBody(kind.skeleton, estimate_rest_pose(tracks["train"]))
     given = tracks["train"], tracks["validation"], size, body
-    poses, vae = usual_motion_vae_training("small")
+    poses, vae, encoder = usual_motion_vae_training("small")
     first = PoseTrainee(*given, distance=Filming().distance)
     train(first, poses, folder / "poses")
     second = MotionVAETrainee(*given, first.learnt(folder / "poses"), distance=Filming().distance)
     train(second, replace(vae, steps=kind.steps), folder / "vae")
-    return MotionVAE.load(folder / "vae")
+    prior = MotionVAE.load(folder / "vae")
+    return with_learnt_codes(second, prior, encoder, folder / "encoder")
+
+
+def with_third_phase(name: str, kind: Kind, data: Path, folder: Path) -> MotionVAE:
+    """Return the shipped networks with codes and encoder learnt again, from an eighth of the views.
+
+    They do not need more views, which are those of the same clips.
+    """
+    fewer = {start: views // 8 for start, views in kind.views.items()}
+    tracks = projected_tracks(replace(kind, views=fewer), kind.clips(data))
+    prior = MotionVAE.load(name)
+    given = tracks["train"], tracks["validation"], prior.settings, prior.body, prior.model.pose
+    trainee = MotionVAETrainee(*given, distance=Filming().distance)
+    settings = usual_motion_vae_training("small")[2]
+    return with_learnt_codes(trainee, prior, settings, folder / "encoder")
 
 
 def trained_evaluator(
@@ -239,8 +262,9 @@ image in depth, 50 % by chance):
 |---|---|---|---|
 {chr(10).join(views)}
 
-The mean speed of 1000 draws is {speed:.2f} times that of held-out motion; {100 * slow:.0f} % of draws are
-slower than 99 % of held-out sequences.
+Draws are from a mixture of {len(prior.codes.weights)} Gaussians fitted to codes of training windows. The mean
+speed of 1000 draws is {speed:.2f} times that of held-out motion; {100 * slow:.0f} % of draws are slower than
+99 % of held-out sequences.
 
 Command: `python notebooks/ship_motion_vae.py {name} --runs runs`.
 """

@@ -15,7 +15,7 @@ import numpy as np
 from probmotion import seeds
 from probmotion.arrays import Array, constant
 from probmotion.extras import torch
-from probmotion.models.latent.standard_normal import StandardNormalPrior
+from probmotion.models.latent.code_mixture import CodePrior
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.protocols import ChecksObservations, Likelihood
 from probmotion.validation import check_count, check_shape
@@ -25,16 +25,17 @@ __all__ = ["ReducedLatent"]
 _ROWS = 64  # Number of draws per batch.
 
 
-class ReducedLatent(StandardNormalPrior):
-    """Prior over θ ~ N(0, I_k) with latent code z = U θ.
+class ReducedLatent(CodePrior):
+    """Prior over θ = Uᵀ z, with latent code z = z̄ + U (θ − Uᵀ z̄).
 
-    U (Z, k) contains the leading eigenvectors of E[JᵀJ], with J = ∂X/∂z the Jacobian of the motion
-    X at prior draws. E[JᵀJ] is estimated by E[(Jᵀv)(Jᵀv)ᵀ] with v ~ N(0, I), one product per draw.
+    z̄ is the mean of the prior's codes. U (Z, k) contains the leading eigenvectors of E[JᵀJ], with
+    J = ∂X/∂z the Jacobian of the motion X at prior draws. E[JᵀJ] is estimated by E[(Jᵀv)(Jᵀv)ᵀ]
+    with v ~ N(0, I), one product per draw.
 
     Parameters
     ----------
     prior : MotionVAE
-        Prior with z ~ N(0, I) and a ``motion`` method differentiable by torch.
+        Prior over codes with a ``motion`` method differentiable by torch.
     k : int
         Number of directions, at most the prior's ``dim``.
     seed : int
@@ -63,6 +64,9 @@ class ReducedLatent(StandardNormalPrior):
         vectors = vectors[:, leading]
         largest = np.abs(vectors).argmax(axis=0)
         self.directions = vectors * np.sign(vectors[largest, np.arange(k)])
+        self.codes = prior.codes.along(self.directions)
+        mean = prior.codes.weights @ prior.codes.means
+        self._rest = mean - self.directions @ (mean @ self.directions)
 
     @cached_property
     def explained(self) -> float:
@@ -71,23 +75,18 @@ class ReducedLatent(StandardNormalPrior):
         along = np.einsum("zk,zy,yk->", self.directions, mean_square, self.directions)
         return float(along / np.trace(mean_square))
 
-    @property
-    def dim(self) -> int:
-        """Length k of θ."""
-        return self.directions.shape[1]
-
     def check_observations(self, likelihood: Likelihood) -> None:
         """Raise ``ValueError`` if the prior does not support the observations."""
         if isinstance(self.prior, ChecksObservations):
             self.prior.check_observations(likelihood)
 
     def latent(self, theta: Array) -> Array:
-        """Return z = U θ, ``(…, k) → (…, Z)``."""
+        """Return z, ``(…, k) → (…, Z)``."""
         check_shape("theta", theta, ("…", self.dim))
-        return theta @ constant(self.directions.T, theta)
+        return constant(self._rest, theta) + theta @ constant(self.directions.T, theta)
 
     def motion(self, theta: Array) -> Array:
-        """Return the motion at z = U θ, ``(…, k) → (…, L, J, 3)``, metres."""
+        """Return the motion at z, ``(…, k) → (…, L, J, 3)``, metres."""
         return self.prior.motion(self.latent(theta))
 
 
@@ -97,7 +96,7 @@ def _mean_square(prior: Any, rng: np.random.Generator) -> np.ndarray:
     total = np.zeros((prior.dim, prior.dim))
     for start in range(0, n, _ROWS):
         rows = min(_ROWS, n - start)
-        z = torch.as_tensor(rng.standard_normal((rows, prior.dim)), dtype=torch.float32)
+        z = torch.as_tensor(prior.initial(rng, rows), dtype=torch.float32)
         z.requires_grad_(True)
         motion = prior.motion(z)
         v = torch.as_tensor(rng.standard_normal(tuple(motion.shape)), dtype=motion.dtype)

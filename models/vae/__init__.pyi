@@ -5,9 +5,8 @@ from .losses import (
     project_to_image as project_to_image,
     weighted_sum as weighted_sum,
 )
-from .model import MotionVAEModel as MotionVAEModel
 from .motion_vae import MotionVAE as MotionVAE
-from .network import MotionVAENetwork as MotionVAENetwork
+from .network import MotionVAEModel as MotionVAEModel, MotionVAENetwork as MotionVAENetwork
 from .pose_network import PoseHypotheses as PoseHypotheses, PoseNetwork as PoseNetwork
 from .rigid_paths import (
     BodyEstimate as BodyEstimate,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from probmotion.extras import torch
-from probmotion.models.vae.model import MotionVAEModel
+from probmotion.models.vae.network import MotionVAEModel
 from probmotion.models.vae.observed_views import observed_view
 from probmotion.posteriors.likelihoods import Keypoints2D
 from probmotion.posteriors.protocols import Likelihood
@@ -83,7 +83,7 @@ class EncodedLatent:
     def loss(
         self, rng: np.random.Generator, *, initial_entropy: bool = True, latent_weight: float = 1.0
     ) -> torch.Tensor:
-        """Return minus the evidence lower bound at one draw: −log p(y | X(z)) + w KL(q ‖ N(0, I)).
+        """Return minus the evidence lower bound at one draw: −log p(y | X(z)) + w KL(q ‖ p).
 
         ``latent_weight`` is w. ``initial_entropy`` is ignored because z includes the first pose.
         """
@@ -93,9 +93,10 @@ class EncodedLatent:
         return latent_weight * self.divergence() - data
 
     def divergence(self) -> torch.Tensor:
-        """Return KL(q ‖ N(0, I)) = −½ Σ (log σ² − σ² − μ² + 1) (Ponymation, equation 6)."""
-        log_variance = 2 * self.log_deviation
-        return -0.5 * (log_variance - torch.exp(log_variance) - self.mean**2 + 1).sum()
+        """Return KL(q ‖ p(z)) (Ponymation, equation 6); for a mixture, an upper bound of it."""
+        entropy = self.log_deviation.sum() + 0.5 * self.prior.dim * math.log(2 * math.pi * math.e)
+        variance = torch.exp(2 * self.log_deviation)
+        return -entropy - self.prior.codes.mean_log_density(self.mean, variance)
 
     def draw(self, streams: RandomNumbers, n: int) -> tuple[np.ndarray, np.ndarray | None]:
         """Return draws (n, L, J, 3), metres, and their z (n, Z)."""

@@ -1,7 +1,8 @@
 """`MotionVAE`: a prior over articulated motion with one latent code per sequence (Ponymation).
 
-z ~ N(0, I); bone rotations ξ = D(z); joints X = FK(ξ); trained on 2D tracks. The rigid path
-(position and orientation of the body per frame) is not part of the code but a separate parameter.
+z ~ p(z); bone rotations ξ = D(z); joints X = FK(ξ); trained on 2D tracks. p(z) is N(0, I), as
+published, or a mixture fitted to codes. The rigid path (position and orientation of the body per
+frame) is not part of the code but a separate parameter.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ import numpy as np
 from probmotion.arrays import Array
 from probmotion.extras import torch
 from probmotion.models.bodies.articulated_body import ArticulatedBody
+from probmotion.models.latent.code_mixture import CodeMixture, CodePrior
 from probmotion.models.latent.row_decoding import decode_rows
-from probmotion.models.latent.standard_normal import StandardNormalPrior
 from probmotion.models.training.checkpoints import (
     Checkpoint,
     load_checkpoint,
@@ -27,8 +28,7 @@ from probmotion.models.training.checkpoints import (
     valid_settings,
 )
 from probmotion.models.vae.inference import VAEEncoder
-from probmotion.models.vae.model import KIND, MotionVAEModel
-from probmotion.models.vae.network import MotionVAENetwork
+from probmotion.models.vae.network import KIND, MotionVAEModel, MotionVAENetwork
 from probmotion.models.vae.pose_network import PoseNetwork
 from probmotion.models.vae.rigid_paths import RigidPath, estimate_body
 from probmotion.models.vae.settings import MotionVAESettings
@@ -40,12 +40,13 @@ from probmotion.validation import check_finite, check_positive, check_shape
 __all__ = ["MotionVAE"]
 
 _ROWS = 64  # number of latent codes decoded at once
+_CODES = ("weights", "means", "factors")  # stored parts of the mixture
 
 
-class MotionVAE(StandardNormalPrior):
+class MotionVAE(CodePrior):
     """Prior over motions of an articulated body, learnt from 2D tracks.
 
-    θ is the latent code z ~ N(0, I). The rigid path is fixed: by default the body is upright at the
+    θ is the latent code z. The rigid path is fixed: by default the body is upright at the
     origin and faces +Z, which suffices without observations. :meth:`placed_by` estimates it from
     keypoints of a known camera.
 
@@ -69,6 +70,8 @@ class MotionVAE(StandardNormalPrior):
         Training record.
     inference_network : InferenceNetwork, optional
         Network for amortised inference; the prior's encoder by default.
+    codes : CodeMixture, optional
+        Distribution of z; N(0, I) by default.
 
     Raises
     ------
@@ -94,6 +97,7 @@ class MotionVAE(StandardNormalPrior):
         log_lengths: np.ndarray | None = None,
         card: Mapping[str, Any] | None = None,
         inference_network: InferenceNetwork | None = None,
+        codes: CodeMixture | None = None,
     ) -> None:
         check_positive("fps", fps)
         self.settings = settings
@@ -108,6 +112,8 @@ class MotionVAE(StandardNormalPrior):
         self.log_lengths = np.zeros(body.n_groups) if log_lengths is None else log_lengths
         check_shape("log_lengths", self.log_lengths, (body.n_groups,))
         check_finite("log_lengths", self.log_lengths)
+        self.codes = CodeMixture.standard(settings.latent) if codes is None else codes
+        check_shape("codes.means", self.codes.means, ("K", settings.latent))
         self.inference_network = VAEEncoder() if inference_network is None else inference_network
         self.skeleton, self.frames, self.fps = body.skeleton, settings.frames, float(fps)
         self.model = MotionVAEModel(network, pose_network).eval().requires_grad_(False)
@@ -116,7 +122,9 @@ class MotionVAE(StandardNormalPrior):
     def load(cls, source: str | Path, **options: Any) -> MotionVAE:
         """Load a trained prior from a checkpoint file, a run folder or a shipped name.
 
-        ``options`` are ``rigid``, ``log_lengths`` and ``inference_network`` of :class:`MotionVAE`.
+        ``options`` are ``rigid``, ``log_lengths``, ``inference_network`` and ``codes`` of
+        :class:`MotionVAE`. Files without a mixture of codes, such as those of a run of the second
+        phase, have N(0, I).
         Raises ``CheckpointError`` for a damaged file or another kind of network, and
         ``FileNotFoundError`` for a missing one.
         """
@@ -128,7 +136,13 @@ class MotionVAE(StandardNormalPrior):
             body = ArticulatedBody(skeleton, np.array(stored["rest"], dtype=np.float64))
             model = MotionVAEModel.of(settings, body)
             fps = stored["fps"]
-        load_weights(model, checkpoint.tensors)
+        tensors = dict(checkpoint.tensors)
+        parts = [tensors.pop(f"codes.{name}") for name in _CODES if f"codes.{name}" in tensors]
+        load_weights(model, tensors)
+        if parts:
+            with valid_settings(source, "code"):
+                stored = CodeMixture(*(values.double().numpy() for values in parts))
+            options = {"codes": stored} | options
         card = checkpoint.settings
         return cls(model.vae, model.pose, settings, body, fps, card=card, **options)
 
@@ -139,7 +153,9 @@ class MotionVAE(StandardNormalPrior):
         """
         if "network" not in self.card:
             raise ValueError("prior must have a training record to be saved; train or load it")
-        save_checkpoint(path, Checkpoint(KIND, self.card, self.model.state_dict()), half=half)
+        codes = {f"codes.{name}": torch.as_tensor(getattr(self.codes, name)) for name in _CODES}
+        tensors = self.model.state_dict() | codes
+        save_checkpoint(path, Checkpoint(KIND, self.card, tensors), half=half)
 
     def placed(self, rigid: RigidPath, log_lengths: np.ndarray | None = None) -> MotionVAE:
         """Return the prior with another rigid path and, if given, other log bone lengths."""
@@ -153,6 +169,7 @@ class MotionVAE(StandardNormalPrior):
             log_lengths=self.log_lengths if log_lengths is None else log_lengths,
             card=self.card,
             inference_network=self.inference_network,
+            codes=self.codes,
         )
 
     def placed_by(self, likelihood: Likelihood) -> MotionVAE:
@@ -187,11 +204,6 @@ class MotionVAE(StandardNormalPrior):
                 "prior must have a rigid path for observations; set it with "
                 "MotionVAE.placed_by(likelihood), or MotionVAE.placed(path) if it is known"
             )
-
-    @property
-    def dim(self) -> int:
-        """Length Z of θ."""
-        return self.settings.latent
 
     def motion(self, theta: Array) -> Array:
         """Return FK(D(θ)), ``(…, dim) → (…, L, J, 3)``, metres, Y up; NumPy or torch."""

@@ -6,8 +6,12 @@ frames, E_t, encode q(z); transformers with timestamp queries, D_t, and bone que
 
 from __future__ import annotations
 
+from dataclasses import asdict
+from typing import Any
+
 from probmotion import seeds
 from probmotion.extras import nn, torch
+from probmotion.models.bodies.articulated_body import ArticulatedBody
 from probmotion.models.diffusion.motion_transformer import sinusoids
 from probmotion.models.vae.layers import (
     BoneDecoder,
@@ -19,10 +23,21 @@ from probmotion.models.vae.layers import (
     check_frames,
     mixed_precision,
 )
+from probmotion.models.vae.pose_network import PoseNetwork
 from probmotion.models.vae.settings import MotionVAESettings
 from probmotion.validation import check_shape
 
-__all__ = ["FrameMap", "MotionVAENetwork", "TimeDecoder", "TimeEncoder"]
+__all__ = [
+    "KIND",
+    "FrameMap",
+    "MotionVAEModel",
+    "MotionVAENetwork",
+    "TimeDecoder",
+    "TimeEncoder",
+    "description_of",
+]
+
+KIND = "motion-vae"  # kind of the checkpoints
 
 _TOKEN_SCALE = 0.02  # standard deviation of the initial tokens μ and σ
 _INITIAL_LOG_VARIANCE = -4.0
@@ -81,14 +96,21 @@ class TimeEncoder(nn.Module):
 
         The log variance is bounded by 10 tanh(·/10), so that its exponentials stay finite.
         """
+        return self.read(self.attended(frames))
+
+    def attended(self, frames: torch.Tensor) -> torch.Tensor:
+        """Return the tokens μ and σ after all layers: ``(B, T, width) → (B, 2, width)``."""
         queries = self.asked.to(frames.dtype).expand(len(frames), -1, -1)
         tokens = torch.cat([queries, frames], dim=1) + self.positions
         for layer in self.layers[:-1]:
             tokens = layer(tokens)
-        result = self.norm(self.layers[-1](tokens, first=2))
+        return self.norm(self.layers[-1](tokens, first=2))
+
+    def read(self, tokens: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return mean and log variance of z given both tokens."""
         bound = _LOG_VARIANCE_BOUND
-        log_variance = bound * torch.tanh(self.log_variance(result[:, 1]) / bound)
-        return self.mean(result[:, 0]), log_variance
+        log_variance = bound * torch.tanh(self.log_variance(tokens[:, 1]) / bound)
+        return self.mean(tokens[:, 0]), log_variance
 
 
 class TimeDecoder(nn.Module):
@@ -153,3 +175,32 @@ class MotionVAENetwork(nn.Module):
         check_shape("latents", latents, ("B", self.settings.latent))
         with mixed_precision(self, latents.device):
             return self.bone_decoder(self.time_decoder(latents))
+
+
+class MotionVAEModel(nn.Module):
+    """Module with the motion VAE network and the pose network as parts."""
+
+    def __init__(self, vae: MotionVAENetwork, pose: PoseNetwork) -> None:
+        super().__init__()
+        self.vae = vae
+        self.pose = pose
+
+    @classmethod
+    def of(cls, settings: MotionVAESettings, body: ArticulatedBody) -> MotionVAEModel:
+        """Return randomly initialised networks for a body."""
+        joints, bones = body.skeleton.n_joints, len(body.bones)
+        return cls(
+            MotionVAENetwork(settings, joints, bones),
+            PoseNetwork(settings, joints, bones, body.n_groups),
+        )
+
+
+def description_of(size: MotionVAESettings, body: ArticulatedBody, fps: float) -> dict[str, Any]:
+    """Return the checkpoint settings of a motion VAE, JSON-compatible."""
+    return {
+        "size": asdict(size),
+        "joint_names": list(body.skeleton.joint_names),
+        "parents": list(body.skeleton.parents),
+        "rest": body.rest.tolist(),
+        "fps": fps,
+    }

@@ -30,8 +30,12 @@ from probmotion.models.vae.losses import (
     roughness,
     weighted_sum,
 )
-from probmotion.models.vae.model import KIND, MotionVAEModel, description_of
-from probmotion.models.vae.network import MotionVAENetwork
+from probmotion.models.vae.network import (
+    KIND,
+    MotionVAEModel,
+    MotionVAENetwork,
+    description_of,
+)
 from probmotion.models.vae.pose_network import PoseHypotheses, PoseNetwork
 from probmotion.models.vae.settings import CONFIDENCE_THRESHOLD, MotionVAESettings
 from probmotion.models.vae.teacher_forcing import TeacherForcedPoses, scaled
@@ -290,6 +294,23 @@ class MotionVAETrainee(_VAETrainee):
         self._teacher = teacher
         self._poses: dict[TrackBatches, TeacherForcedPoses] = {}
 
+    def taught_windows(
+        self, rng: np.random.Generator, n: int, device: torch.device
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, PoseHypotheses]:
+        """Return keypoints, visibility, rest pose and teacher poses of n random windows."""
+        *inputs, _, teacher = self._windows(self.batches, rng, n, device)
+        return (*inputs, teacher)
+
+    def _windows(
+        self, batches: TrackBatches, rng: np.random.Generator, n: int, device: torch.device
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, PoseHypotheses]:
+        """Return keypoints, visibility, rest pose, confidences and teacher poses of windows."""
+        drawn = batches.draw(rng, n)
+        keypoints, seen, rest = self._inputs(drawn, device)
+        confidence = torch.as_tensor(drawn.confidence, device=device)
+        teacher = self._teacher_poses(batches, drawn, keypoints, confidence, rest)
+        return keypoints, seen, rest, confidence, teacher
+
     def _loss(
         self,
         network: nn.Module,
@@ -299,10 +320,7 @@ class MotionVAETrainee(_VAETrainee):
         device: torch.device,
     ) -> torch.Tensor:
         assert isinstance(network, MotionVAEModel)
-        drawn = batches.draw(rng, n)
-        keypoints, seen, rest = self._inputs(drawn, device)
-        confidence = torch.as_tensor(drawn.confidence, device=device)
-        teacher = self._teacher_poses(batches, drawn, keypoints, confidence, rest)
+        keypoints, seen, rest, confidence, teacher = self._windows(batches, rng, n, device)
         mean, log_variance = network.vae.encode(keypoints, seen, rest)
         noise = rng.standard_normal(tuple(mean.shape), dtype=np.float32)
         latent = mean + (0.5 * log_variance).exp() * torch.as_tensor(noise, device=device)
@@ -340,19 +358,20 @@ class MotionVAETrainee(_VAETrainee):
         return scaled(best_hypothesis(hypotheses, weighted_sum(terms, self.size)), scale)
 
 
-def usual_motion_vae_training(size: str) -> tuple[TrainingSettings, TrainingSettings]:
-    """Return the training settings of both phases for a size: ``tiny``, ``small`` or ``paper``.
+def usual_motion_vae_training(size: str) -> tuple[TrainingSettings, ...]:
+    """Return the training settings of three phases for a size: ``tiny``, ``small`` or ``paper``.
 
-    The paper trains for 120 and 180 epochs; ``paper`` assumes 1000 steps per epoch.
+    The third calibrates the encoder. The paper trains the others for 120 and 180 epochs; ``paper``
+    assumes 1000 steps per epoch.
     Raises ``ValueError`` for an unknown size.
     """
     tiny = TrainingSettings(steps=300, batch=16, learning_rate=5e-3, ema=0.97)
     small = replace(tiny, steps=2000, batch=32, learning_rate=1e-3, ema=0.995)
     paper = TrainingSettings(steps=120_000, learning_rate=1e-4, warmup=1000)
     known = {
-        "tiny": (tiny, tiny),
-        "small": (small, replace(small, steps=2500)),
-        "paper": (paper, replace(paper, steps=180_000)),
+        "tiny": (tiny, tiny, tiny),
+        "small": (small, replace(small, steps=2500), replace(small, steps=3000, batch=256)),
+        "paper": (paper, replace(paper, steps=180_000), replace(paper, steps=20_000)),
     }
     if size not in known:
         raise ValueError(f"size must be one of {', '.join(known)}, got {size!r}")

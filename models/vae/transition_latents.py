@@ -39,7 +39,7 @@ def long_motion(
 
     A transition consists of one or more motions of the prior. Its first two frames match the end
     of the previous segment, its last two frames the start of the next. L-BFGS minimises the
-    squared angles between these frames, plus squared accelerations and a weak ‖z‖² penalty. The
+    squared angles between these frames, plus squared accelerations and a weak −2 log p(z). The
     remaining mismatch is removed by small bone rotations, interpolated by the cubic in time through
     the four frames. Segments are unchanged; the root pose is that of the first frame of the path.
 
@@ -55,7 +55,7 @@ def long_motion(
         Number of codes per transition. By default the smallest, up to four, for which no joint
         accelerates more than in the segments, or else that with the smallest acceleration.
     prior_weight : float
-        Weight of ‖z‖² relative to squared radians.
+        Weight of −2 log p(z) relative to squared radians.
 
     Returns
     -------
@@ -143,7 +143,8 @@ def _transition(
         optimiser.zero_grad()
         joined, mismatch = _joined(vector_to_matrix(prior.turns(codes)), before, after)
         acceleration = 0.5 * (joined.diff(n=2, dim=0) ** 2).sum()
-        total = mismatch + _ACCELERATION_WEIGHT * acceleration + prior_weight * (codes**2).sum()
+        unlikely = -2 * prior.log_density(codes).sum()
+        total = mismatch + _ACCELERATION_WEIGHT * acceleration + prior_weight * unlikely
         total.backward()
         return total
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -22,12 +23,15 @@ __all__ = ["TrainMotionVAE"]
 class TrainMotionVAE:
     """Train a pose network, then a motion VAE (prior over short 3D motions), on 2D tracks.
 
+    The codes of the tracks are then fitted by a mixture, and the encoder is calibrated.
+
     Run the same command again to resume an interrupted run; increase --steps to extend
     the training of the VAE.
     """
 
     out: Path
-    """Output folder; its subfolders poses and vae contain model.safetensors and losses.csv."""
+    """Output folder for model.safetensors; its subfolders poses, vae and encoder contain the
+    networks of the three phases and their losses.csv."""
 
     size: Literal["tiny", "small", "paper"] = "small"
     """Network size; tiny trains in seconds, small in 20 minutes on one core, paper needs a GPU."""
@@ -57,7 +61,10 @@ class TrainMotionVAE:
 
     def run(self) -> None:
         from probmotion.data.projections import Filming
+        from probmotion.models.training.checkpoints import MODEL
         from probmotion.models.training.runs import STATE
+        from probmotion.models.vae.code_fitting import with_learnt_codes
+        from probmotion.models.vae.motion_vae import MotionVAE
         from probmotion.models.vae.settings import MotionVAESettings
         from probmotion.models.vae.training import (
             MotionVAETrainee,
@@ -69,7 +76,8 @@ class TrainMotionVAE:
         given = {"frames": self.frames, "kl": self.kl}
         changes = {name: value for name, value in given.items() if value is not None}
         size = replace(getattr(MotionVAESettings, self.size)(), **changes)
-        poses, vae = map(self.training.settings, usual_motion_vae_training(self.size))
+        phases = usual_motion_vae_training(self.size)
+        poses, vae, encoder = map(self.training.settings, phases)
         check_positive("threshold", self.threshold)
         if self.distance is not None:
             check_positive("distance", self.distance)
@@ -94,6 +102,15 @@ class TrainMotionVAE:
         teacher = pose_trainee.learnt(self.out / "poses")
         trainee = MotionVAETrainee(tracks.train, tracks.validation, size, body, teacher, **shared)
         run_training(trainee, vae, self.out / "vae", device)
+        prior = with_learnt_codes(
+            trainee,
+            MotionVAE.load(self.out / "vae"),
+            encoder,
+            self.out / "encoder",
+            learn=partial(run_training, device=device),
+        )
+        prior.save(self.out / MODEL)
+        print(f"wrote {self.out / MODEL}: the motion VAE with the mixture of its codes")
 
     def _body(self, tracks: LearningTracks) -> ArticulatedBody:
         from probmotion.io.files import load

@@ -55,7 +55,8 @@ def observed_draw_problem(name: str, description: str, prior: str, how: str) -> 
 
     ``how`` is as for :func:`~probmotion.problems.observations.observe`.
     """
-    vae = models.MotionVAE.load(prior)
+    # Codes are from N(0, I), as published, not from the mixture fitted to codes of real motion.
+    vae = models.MotionVAE.load(prior, codes=None)
     # Treat the prior's rigid path as known instead of estimating it from the keypoints.
     vae = vae.placed(vae.rigid)
     truth = vae.motion(vae.initial(seeds.generator(0, name), 1))[0]

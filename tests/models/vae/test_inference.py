@@ -12,8 +12,8 @@ import torch
 from probmotion import Cameras, Joints3D, Keypoints2D, Motion, MotionPosterior, Skeleton
 from probmotion.models.bodies.articulated_body import ArticulatedBody
 from probmotion.models.vae.inference import VAEEncoder
-from probmotion.models.vae.model import MotionVAEModel
 from probmotion.models.vae.motion_vae import MotionVAE
+from probmotion.models.vae.network import MotionVAEModel
 from probmotion.models.vae.rigid_paths import RigidPath
 from probmotion.models.vae.settings import MotionVAESettings
 from probmotion.samplers import DVAEInference

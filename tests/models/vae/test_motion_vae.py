@@ -12,10 +12,11 @@ import torch
 from probmotion import Cameras, Joints3D, Keypoints2D, Motion, MotionPosterior, Skeleton
 from probmotion.geometry.rotations import vector_to_matrix
 from probmotion.models.bodies.articulated_body import ArticulatedBody
+from probmotion.models.latent.code_mixture import CodeMixture
 from probmotion.models.latent.reduced_latent import ReducedLatent
 from probmotion.models.training.checkpoints import Checkpoint, CheckpointError, save_checkpoint
-from probmotion.models.vae.model import KIND, MotionVAEModel, description_of
 from probmotion.models.vae.motion_vae import MotionVAE
+from probmotion.models.vae.network import KIND, MotionVAEModel, description_of
 from probmotion.models.vae.observed_views import observed_view
 from probmotion.models.vae.pose_network import PoseHypotheses
 from probmotion.models.vae.rigid_paths import RigidPath
@@ -101,13 +102,37 @@ def test_draws_do_not_depend_on_the_batch(prior):
     assert draws.dtype == np.float64
 
 
+def mixture():
+    rng = np.random.default_rng(4)
+    factors = np.tril(0.3 * rng.standard_normal((2, 3, 3))) + 0.5 * np.eye(3)
+    return CodeMixture(np.array([0.3, 0.7]), rng.standard_normal((2, 3)), factors)
+
+
 @pytest.mark.parametrize(("half", "tolerance"), [(False, 1e-12), (True, 5e-3)])
-def test_checkpoint_round_trip(prior, tmp_path, half, tolerance):
+def test_checkpoint_round_trip(tmp_path, half, tolerance):
+    prior = build(codes=mixture())
     prior.save(tmp_path / "model.safetensors", half=half)
     other = MotionVAE.load(tmp_path, rigid=make_path())
     expected = prior.placed(make_path()).motion(codes())
     np.testing.assert_allclose(other.motion(codes()), expected, atol=tolerance)
     assert (other.skeleton, other.fps, other.settings) == (LEGS, 20.0, TINY)
+    np.testing.assert_allclose(other.codes.factors, prior.codes.factors, atol=tolerance)
+    density = prior.placed(make_path()).log_density(codes())
+    np.testing.assert_allclose(other.log_density(codes()), density, atol=40 * tolerance)
+
+
+def test_codes_follow_the_mixture():
+    drawn = build(codes=mixture()).initial(np.random.default_rng(0), 5)
+    np.testing.assert_array_equal(drawn, mixture().draw(np.random.default_rng(0), 5))
+    with pytest.raises(ValueError, match=r"codes.means must have shape"):
+        build(codes=CodeMixture.standard(2))
+
+
+def test_checkpoints_without_a_mixture_have_the_standard_normal(prior, tmp_path):
+    path = tmp_path / "model.safetensors"
+    save_checkpoint(path, Checkpoint(KIND, prior.card, prior.model.state_dict()))
+    expected = -0.5 * (codes() ** 2 + math.log(2 * math.pi)).sum(axis=1)
+    np.testing.assert_allclose(MotionVAE.load(path).log_density(codes()), expected)
 
 
 class FixedPoses(torch.nn.Module):
@@ -267,6 +292,10 @@ class LinearMotions:
         rng = np.random.default_rng(0)
         self.rotation = np.linalg.qr(rng.standard_normal((5, 5)))[0]
         self.basis = np.linalg.qr(rng.standard_normal((54, 5)))[0]
+        self.codes = CodeMixture.standard(5)
+
+    def initial(self, rng, n):
+        return self.codes.draw(rng, n)
 
     def motion(self, theta):
         matrix = self.rotation @ (self.gains[:, None] * self.basis.T)
@@ -293,7 +322,8 @@ def test_all_directions_reproduce_the_prior(prior):
     assert reduced.explained == pytest.approx(1.0)
     theta = codes()
     np.testing.assert_allclose(reduced.motion(theta), prior.motion(reduced.latent(theta)))
-    np.testing.assert_allclose(reduced.log_density(theta), prior.log_density(theta))
+    density = prior.log_density(reduced.latent(theta))
+    np.testing.assert_allclose(reduced.log_density(theta), density)
     assert 0.3 < ReducedLatent(prior, 1).explained < ReducedLatent(prior, 2).explained < 1
     with pytest.raises(ValueError, match="k must be at most the prior's 3 dimensions, got 4"):
         ReducedLatent(prior, 4)

@@ -149,7 +149,7 @@ def test_second_phase_learns_with_a_fixed_teacher(learnt, teacher):
 @pytest.mark.slow
 def test_short_training_yields_3d_walks(base, body, tmp_path):
     given = base | {"size": MotionVAESettings.small()}
-    poses, vae = usual_motion_vae_training("small")
+    poses, vae, _ = usual_motion_vae_training("small")
     first = PoseTrainee(**given)
     train(first, replace(poses, steps=800), tmp_path / "poses", progress=False)
     teacher = first.learnt(tmp_path / "poses")

@@ -12,8 +12,8 @@ from probmotion import Skeleton
 from probmotion.geometry.rotations import vector_to_matrix
 from probmotion.models.bodies.articulated_body import ArticulatedBody
 from probmotion.models.vae import transition_latents
-from probmotion.models.vae.model import MotionVAEModel
 from probmotion.models.vae.motion_vae import MotionVAE
+from probmotion.models.vae.network import MotionVAEModel
 from probmotion.models.vae.settings import MotionVAESettings
 from probmotion.models.vae.transition_latents import (
     _corrected,

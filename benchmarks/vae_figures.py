@@ -1,0 +1,131 @@
+"""Speeds, calibration and joint errors of the motion VAEs, for ``accuracy.py learnt``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from probmotion import seeds
+from probmotion.data.projections import Filming, centre_motion
+from probmotion.data.synthetic.animals import animal_clips
+from probmotion.data.synthetic.walks import walk_clips
+from probmotion.geometry.rotations import vector_to_matrix
+from probmotion.models.vae.losses import best_hypothesis, predicted_hypotheses, project_to_image
+from probmotion.models.vae.motion_vae import MotionVAE
+from probmotion.models.vae.view_hypotheses import evaluate_hypotheses
+from probmotion.motion.distances import windows
+from probmotion.motion.motion import Motion
+
+NOISE = 0.01  # of keypoints of real motion, metres at the subject; as in training
+SEQUENCES = 100  # of real motion, whose codes are found
+TO_Y_UP = np.array([1.0, -1.0, -1.0])
+
+
+def vae_figures(folder: Path) -> Iterator[tuple[str, float]]:
+    """Yield the figures of ``walk-vae`` (people) and ``animal-vae``.
+
+    Speed ratio: of 1000 draws to the test clips; slow: slower than 99 % of their seconds. Coverage:
+    of 90 % intervals of the encoder, seen by one camera; ``simulated``: of codes of draws, with
+    keypoint errors as large as the decoder's on training tracks; otherwise of the codes of test
+    clips, which are those of the highest posterior density given the true motion in 3D.
+    """
+    for name, label, clips in (
+        ("walk-vae", "people", walk_clips(folder)["test"]),
+        ("animal-vae", "animals", animal_clips(folder)["test"]),
+    ):
+        prior = MotionVAE.load(name)
+        real = real_windows(prior, clips)
+        speeds, real_speeds = map(speed, (prior.sample(seeds.generator(0, "draws"), 1000), real))
+        yield f"vae_speed_ratio_{label}", speeds.mean() / real_speeds.mean()
+        yield f"vae_slow_{label}", float((speeds < np.quantile(real_speeds, 0.01)).mean())
+        yield f"vae_coverage_90_simulated_{label}", simulated_coverage(prior, 2000)
+        yield f"vae_coverage_90_{label}", real_coverage(prior, real)
+    dog = [clip for clip in clips if clip.name.startswith("dog3d")]
+    accuracy = evaluate_hypotheses(prior.model.pose, prior.settings, prior.body, dog, fps=prior.fps)
+    yield "dog_mm", 1000 * accuracy.error
+
+
+def real_windows(prior: MotionVAE, clips: list[Motion]) -> np.ndarray:
+    """Return the root-centred windows of clips, (N, L, J, 3), metres."""
+    motions = [centre_motion(clip.retarget(prior.skeleton).resample(prior.fps)) for clip in clips]
+    return np.concatenate([windows(motion.positions, prior.frames) for motion in motions])
+
+
+def speed(motions: np.ndarray) -> np.ndarray:
+    """Return the mean speed of joints of each motion, metres per frame."""
+    return np.linalg.norm(np.diff(motions, axis=1), axis=-1).mean(axis=(1, 2))
+
+
+def inside(prior: MotionVAE, z: torch.Tensor, keypoints: np.ndarray) -> float:
+    """Return the share of codes in the 90 % intervals of the encoder."""
+    seen = torch.ones(keypoints.shape[:-1])
+    rest = torch.as_tensor(prior.body.rest_positions, dtype=torch.float32)
+    points = torch.as_tensor(keypoints, dtype=torch.float32)
+    with torch.no_grad():
+        mean, log_variance = prior.model.vae.encode(points, seen, rest)
+    return float(((z - mean).abs() < 1.645 * (0.5 * log_variance).exp()).float().mean())
+
+
+def centred(prior: MotionVAE, keypoints: np.ndarray) -> np.ndarray:
+    """Return keypoints relative to the root in every frame."""
+    return keypoints - keypoints[..., [prior.skeleton.roots[0]], :]
+
+
+def simulated_coverage(prior: MotionVAE, n: int) -> float:
+    """Return the coverage of codes of draws that stand upright before random cameras."""
+    rng = seeds.generator(0, "simulated")
+    z = prior.initial(rng, n)
+    positions = prior.row_by_row(z) - prior.rigid.translations[:, None]
+    rotation = TO_Y_UP[:, None] * Filming().cameras(rng, n).rotation
+    posed = np.einsum("nij,nlkj->nlki", rotation, positions)
+    image = project_to_image(torch.as_tensor(posed), Filming().distance).numpy()
+    image = image + prior.card["deviation"] * rng.standard_normal(image.shape)
+    return inside(prior, torch.as_tensor(z, dtype=torch.float32), centred(prior, image))
+
+
+def real_coverage(prior: MotionVAE, real: np.ndarray) -> float:
+    """Return the coverage of the codes of real motion."""
+    rng = seeds.generator(0, "real")
+    motions = real[rng.integers(0, len(real), SEQUENCES)]
+    cameras = Filming().cameras(rng, SEQUENCES)
+    clean = np.stack([cameras.view(i).project(x)[0] for i, x in enumerate(motions)])
+    noisy = clean + NOISE * rng.standard_normal(clean.shape)
+    truth = np.einsum("nij,nlkj->nlki", cameras.rotation, motions) * TO_Y_UP
+    z = codes_of(prior, truth, centred(prior, clean))
+    return inside(prior, z, centred(prior, noisy))
+
+
+def codes_of(prior: MotionVAE, truth: np.ndarray, keypoints: np.ndarray) -> torch.Tensor:
+    """Return the codes of motions (n, L, J, 3) relative to the camera, by gradient descent.
+
+    The body's rotations in every frame and its bone lengths are free as well; they start at the
+    estimates of the pose network.
+    """
+    points = keypoints.astype(np.float32)
+    given = prior.model.pose, prior.settings, prior.body, points, np.ones(points.shape[:-1])
+    pose = best_hypothesis(*predicted_hypotheses(*given, Filming().distance))
+    rest = torch.as_tensor(prior.body.rest_positions, dtype=torch.float32)
+    with torch.no_grad():
+        start, _ = prior.model.vae.encode(
+            torch.as_tensor(points), torch.ones(points.shape[:-1]), rest
+        )
+    z, lengths = start.clone().requires_grad_(), pose.log_lengths.clone().requires_grad_()
+    turn = torch.zeros((*pose.rotation.shape[:2], 3), requires_grad=True)
+    origin = torch.zeros_like(turn)
+    target = torch.as_tensor(truth, dtype=torch.float32)
+    steps = 150
+    optimiser = torch.optim.Adam([z, lengths, turn], lr=0.03)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    for _ in range(steps):
+        rotation = pose.rotation @ vector_to_matrix(turn)
+        posed = prior.body.positions(prior.model.vae.decode(z), rotation, origin, lengths)
+        error = ((posed - target) ** 2).sum() / (2 * prior.card["deviation"] ** 2)
+        loss = error - prior.log_density(z).sum()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+    return z.detach()
