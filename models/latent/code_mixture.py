@@ -144,7 +144,8 @@ class CodeMixture:
     def _spectra(self) -> tuple[np.ndarray, np.ndarray]:
         """Variances (K, Z) and directions (K, Z, Z, in columns) of the components."""
         covariances = self.factors @ self.factors.swapaxes(-1, -2)
-        return tuple(np.linalg.eigh(covariances))
+        variances, directions = np.linalg.eigh(covariances)
+        return variances, directions
 
     def log_density(self, z: Array) -> Array:
         """Return log p(z): ``(…, Z) → (…)``."""

@@ -69,7 +69,8 @@ class EncodedWindows:
             squares.append(error[seen > 0].square().mean())
             parts.append((mean, log_variance, teacher.rotation, teacher.log_lengths, seen))
         deviation = float(torch.stack(squares).mean().sqrt())
-        return cls(*map(torch.cat, zip(*parts, strict=True)), deviation)
+        mean, log_variance, rotation, log_lengths, seen = map(torch.cat, zip(*parts, strict=True))
+        return cls(mean, log_variance, rotation, log_lengths, seen, deviation)
 
     def simulated(
         self,
