@@ -134,7 +134,7 @@ def test_missing_protocols_are_named(sampler, minimal):
     assert suited(posterior) == []
     with pytest.raises(
         UnsupportedPosterior,
-        match=rf"^{sampler.name} needs a prior with \w+( (or|and) \w+)?, got Mi",
+        match=rf"^{sampler.name} needs a prior with \w+( (or|and) \w+)*, got Mi",
     ):
         sampler.sample(posterior, draws=1, progress=False)
 
