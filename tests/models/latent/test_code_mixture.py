@@ -120,7 +120,11 @@ def test_fit_recovers_a_mixture_of_noisy_codes():
     for k, component in enumerate(order):
         found = fitted.factors[component] @ fitted.factors[component].T
         np.testing.assert_allclose(found, covariance(k) + 0.04 * np.eye(3), atol=0.08)
+    variances = rng.uniform(0.01, 0.5, codes.shape)
     one = CodeMixture.fit(codes, variances, 1, rng)
+    total = np.cov(codes.T, bias=True) + np.diag(variances.mean(axis=0)) + 1e-3 * np.eye(3)
+    np.testing.assert_allclose(one.means[0], codes.mean(axis=0), atol=1e-9)
+    np.testing.assert_allclose(one.factors[0] @ one.factors[0].T, total, atol=1e-9)
     assert fitted.log_density(codes).mean() > one.log_density(codes).mean() + 0.5
 
 
