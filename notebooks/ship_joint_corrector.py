@@ -25,7 +25,8 @@ from scipy.fft import dct
 from scipy.interpolate import CubicSpline
 
 from probmotion import seeds
-from probmotion.data.denoising_clips import action_clips, denoising_clips
+from probmotion.data.denoising_clips import denoising_clips
+from probmotion.data.person_clips import action_clips
 from probmotion.extras import torch
 from probmotion.files import read_arrays, written_whole
 from probmotion.models.bodies.body_states import turned_about_vertical

@@ -7,15 +7,11 @@ from pathlib import Path
 
 from probmotion.data.person_clips import clip_segments, on_person
 from probmotion.data.synthetic.gaits import GAITS, make_gait
-from probmotion.io.files import load
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_count, check_positive
 
-__all__ = [
-    "ACTION_CLIPS", "DENOISING_CLIPS", "action_clips", "denoising_clips",
-    "synthetic_denoising_clips",
-]  # fmt: skip
+__all__ = ["DENOISING_CLIPS", "denoising_clips", "synthetic_denoising_clips"]
 
 _FPS = 30.0
 _HUMANOID_TRAINING = (
@@ -50,32 +46,6 @@ excluded: ``humanoid3d_walk`` and ``humanoid3d_zombie_walk`` are excerpts of oth
 ``humanoid3d_jog`` is shorter than a window.
 """
 
-ACTION_CLIPS: Mapping[str, tuple[str, ...]] = {
-    "train": (
-        *(f"basketball_{trial}" for trial in (1, 2, 4)),
-        *(f"basketball_signal_{trial}" for trial in (1, 3, 4)),
-        "directing_traffic_1",
-        *(f"{action}_{trial}" for action in ("jumping", "running") for trial in (1, 2, 3, 4)
-          if (action, trial) not in (("jumping", 2), ("running", 3))),
-        *(f"walk_{trial}" for trial in range(13, 53) if trial not in (20, 31, 33, 47, 52)),
-        *(f"walking_{trial}" for trial in (1, 2, 4)),
-    ),
-    "validation": (
-        "basketball_3", "basketball_signal_2", "directing_traffic_4", "jumping_2", "running_3",
-        "walk_20", "walk_33", "walk_47", "walking_3",
-    ),
-    "test": (
-        "basketball_5", "basketball_signal_5", "jumping_5", "running_5", "walk_31", "walk_52",
-        "walking_5",
-    ),
-    "soccer": tuple(f"soccer_{trial}" for trial in range(1, 6)),
-}  # fmt: skip
-"""Clips of CMU's actions by part of the split; soccer is kept out whole, as an unseen action.
-
-The prior ``cmu-motion`` was fitted to all of them but soccer; who uses their validation and test
-parts fits a prior to the training parts.
-"""
-
 _STYLES = tuple(style for style, gait in GAITS.items() if gait.body == "person")
 
 
@@ -98,24 +68,6 @@ def denoising_clips(
             for segment in clip_segments(Path(folder) / f"{name}.npz", convert)
         ]
         for part, names in DENOISING_CLIPS.items()
-    }
-
-
-def action_clips(
-    folder: str | Path, convert: Callable[[Motion], Motion] | None = None
-) -> dict[str, list[Motion]]:
-    """Return the clips of CMU's actions of each part at 30 frames per second.
-
-    ``folder`` contains the folder ``cmu_actions`` with the clips of :data:`ACTION_CLIPS` as
-    ``.npz``; ``convert`` and errors are those of :func:`denoising_clips`.
-    """
-    convert = on_person if convert is None else convert
-    return {
-        part: [
-            convert(load(Path(folder) / "cmu_actions" / f"{name}.npz")).resample(_FPS)
-            for name in names
-        ]
-        for part, names in ACTION_CLIPS.items()
     }
 
 

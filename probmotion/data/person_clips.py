@@ -9,6 +9,9 @@
 - ``unseen``: all clips of one action, soccer, which is in no other part
 - ``excluded``: two excerpts of other clips, and a clip shorter than a second
 - ``train``: all others
+
+The column ``corrector`` has the parts of ``cmu_actions`` in the training of ``joint-corrector``,
+which differ, as it was trained before this split.
 """
 
 from __future__ import annotations
@@ -25,7 +28,10 @@ from probmotion.io.files import load
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
 
-__all__ = ["LEARNT_PARTS", "clip_segments", "clips_of_actions", "moving_clips", "on_person"]
+__all__ = [
+    "LEARNT_PARTS", "action_clips", "clip_segments", "clips_of_actions", "moving_clips",
+    "on_person",
+]  # fmt: skip
 
 LEARNT_PARTS = ("train", "validation", "test")
 """Parts of the split by clip; clips of other parts are in none of them."""
@@ -65,6 +71,26 @@ def moving_clips(folder: str | Path) -> dict[str, list[Motion]]:
             for segment in clip_segments(Path(folder) / f"{name}.npz", on_person)
         ]
         for part, names in clips_of_actions("walking", "running", "jumping").items()
+    }
+
+
+def action_clips(folder: str | Path) -> dict[str, list[Motion]]:
+    """Return the clips of ``cmu_actions`` by their part in the training of ``joint-corrector``.
+
+    Motions are on ``person14`` at 30 fps.
+    The prior ``cmu-motion`` was fitted to all of them but soccer, a part of its own; who uses the
+    validation and test parts fits a prior to the training part. ``folder`` and errors are those of
+    :func:`moving_clips`.
+    """
+    with _TABLE.open(encoding="utf-8", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["corrector"]]
+    return {
+        part: [
+            on_person(load(Path(folder) / f"{row['clip']}.npz")).resample(_FPS)
+            for row in rows
+            if row["corrector"] == part
+        ]
+        for part in (*LEARNT_PARTS, "soccer")
     }
 
 

@@ -5,9 +5,7 @@ import pytest
 
 from probmotion import Skeleton
 from probmotion.data.denoising_clips import (
-    ACTION_CLIPS,
     DENOISING_CLIPS,
-    action_clips,
     denoising_clips,
     synthetic_denoising_clips,
 )
@@ -44,19 +42,6 @@ def test_parts_are_disjoint_and_exclude_three_clips(real_data):
     excluded = {f"deepmimic_human/humanoid3d_{name}" for name in ("jog", "walk", "zombie_walk")}
     assert all_clips - set(names) == excluded
     assert load(real_data / "deepmimic_human" / "humanoid3d_jog.npz").frames < 30
-
-
-def test_actions_are_split_by_clip_and_soccer_is_kept_out(real_data):
-    names = [name for part in ACTION_CLIPS.values() for name in part]
-    paths = (real_data / "cmu_actions").glob("*.npz")
-    assert sorted(names) == sorted(path.stem for path in paths)
-    parts = action_clips(real_data)
-    assert {part for part in parts for clip in parts[part] if "soccer" in clip.name} == {"soccer"}
-    assert {(clip.skeleton, clip.fps) for part in parts.values() for clip in part} == {
-        (PERSON, 30.0)
-    }
-    frames = {part: sum(clip.frames for clip in clips) for part, clips in parts.items()}
-    assert frames == {"train": 8629, "validation": 2727, "test": 1353, "soccer": 689}
 
 
 def test_recorded_clips(clips):

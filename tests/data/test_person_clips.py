@@ -8,7 +8,7 @@ import pytest
 
 from probmotion.data import person_clips
 from probmotion.data.denoising_clips import DENOISING_CLIPS
-from probmotion.data.person_clips import LEARNT_PARTS, clips_of_actions, moving_clips
+from probmotion.data.person_clips import LEARNT_PARTS, action_clips, clips_of_actions, moving_clips
 from probmotion.data.synthetic.walks import WALK_CLIPS
 from probmotion.motion.skeleton import Skeleton
 
@@ -64,3 +64,13 @@ def test_moving_clips_have_no_marker_jumps(real_data):
     for clip in everything:
         speed = np.linalg.norm(np.diff(clip.positions, axis=0), axis=-1).max() * clip.fps
         assert speed < 9, clip.name
+
+
+def test_actions_of_the_corrector_are_split_and_soccer_is_kept_out(real_data):
+    parts = action_clips(real_data)
+    assert {part for part in parts for clip in parts[part] if "soccer" in clip.name} == {"soccer"}
+    assert {(clip.skeleton, clip.fps) for part in parts.values() for clip in part} == {
+        (Skeleton.preset("person14"), 30.0)
+    }
+    frames = {part: sum(clip.frames for clip in clips) for part, clips in parts.items()}
+    assert frames == {"train": 8629, "validation": 2727, "test": 1353, "soccer": 689}
