@@ -11,8 +11,14 @@ exact denoisers, which alternate between levels, cover the sphere
 
 √ᾱ D(X) − X = (1−ᾱ) M⁻¹ ∇ Σ_v log p_v(P_v X), so for γ = 1 the corrector is Langevin dynamics
 preconditioned by Λ with stationary density Π_v p_v(P_v X)^(1/V), the logarithmic pool of the noisy
-2D marginals. With γ > 0, sampling is not exact for an isotropic Gaussian. By default, γ is
-therefore ½ only at high noise, where the mode is determined, and 0 at low noise.
+2D marginals. For γ = 0 and views that weight all directions equally, it is Π_v p_v(P_v X)^(3/2V).
+
+What two thirds of the coordinates, a view, say of a common mode is thus counted once with γ = 1 and
+one and a half times with γ = 0, which has too little variance. The noise of single coordinates is
+counted two thirds of a time with γ = 1 and once with γ = 0, which is exact for an isotropic
+Gaussian. By default, γ is therefore 1 at the noise levels at which shared directions of motion are
+determined, and 0 below. Above them, it is 0 as well: a large displacement along one axis is seen
+whole by the views across it, and γ = 1 would draw too many of these motions.
 """
 
 from __future__ import annotations
@@ -58,9 +64,11 @@ class MultiViewPredictorCorrector(AncestralSampler):
         Elevation of these views, radians; by default that of the prior's training. Exact denoisers
         hold for any view, and by default alternate between five sets of three orthogonal views.
     gamma : float
-        Exponent γ at high noise, at least 0.
+        Exponent γ between two noise levels, at least 0.
     gamma_from : float
         Noise level σ below which γ is 0.
+    gamma_to : float, optional
+        Noise level σ from which γ is 0; ``None`` for none.
     corrected_from : float
         Noise level σ below which corrector steps are skipped.
     levels : AnyLevels
@@ -82,8 +90,9 @@ class MultiViewPredictorCorrector(AncestralSampler):
     corrector_size: float = 0.6
     n_views: int = 5
     elevation: float | None = None
-    gamma: float = 0.5
+    gamma: float = 1.0
     gamma_from: float = 1.0
+    gamma_to: float | None = 4.0
     corrected_from: float = 1.0
     levels: AnyLevels = field(default_factory=partial(Karras, smallest=0.01))
     integrator: AnyIntegrator = field(default_factory=SecondOrderSDE)
@@ -97,8 +106,10 @@ class MultiViewPredictorCorrector(AncestralSampler):
         check_positive("corrector_size", self.corrector_size)
         if self.corrector_size > 1:
             raise ValueError(f"corrector_size must be at most 1, got {self.corrector_size}")
-        for name in ("gamma", "gamma_from", "corrected_from"):
+        for name in ("gamma", "gamma_from", "gamma_to", "corrected_from"):
             value = getattr(self, name)
+            if value is None and name == "gamma_to":
+                continue
             if not 0 <= value < math.inf:
                 raise ValueError(f"{name} must be a finite number of at least 0, got {value}")
 
@@ -119,13 +130,16 @@ class MultiViewPredictorCorrector(AncestralSampler):
             levels=Cosine(),
             integrator=DDPM(),
             corrector_size=0.5,
+            gamma=0.5,
             gamma_from=0.5,
+            gamma_to=None,
             corrected_from=0.15,
         )
 
     def gamma_at(self, level: float) -> float:
         """Return γ at a noise level σ."""
-        return self.gamma if level >= self.gamma_from else 0.0
+        below = self.gamma_to is None or level < self.gamma_to
+        return self.gamma if level >= self.gamma_from and below else 0.0
 
     def _state(self, posterior: MotionPosterior) -> State:
         prior = posterior.prior

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import solve_continuous_lyapunov
 
 from probmotion import Cameras, MotionPosterior
 from probmotion.samplers import MultiViewAncestral, MultiViewPredictorCorrector
@@ -15,6 +16,7 @@ from probmotion.samplers.diffusion.views import (
     MultiViewDenoiser,
     Views,
     pools,
+    symmetric_power,
     view_sets,
     views_around,
 )
@@ -57,9 +59,11 @@ def test_evaluations_are_counted(gaussian, settings, calls):
 
 
 def test_gamma_by_noise_level():
+    levels = (0.01, 0.5, 0.999, 1.0, 3.999, 4.0, 50.0)
     sampler = MultiViewPredictorCorrector()
-    levels = (0.01, 0.5, 0.999, 1.0, 2.0, 50.0)
-    assert [sampler.gamma_at(level) for level in levels] == [0, 0, 0, 0.5, 0.5, 0.5]
+    assert [sampler.gamma_at(level) for level in levels] == [0, 0, 0, 1, 1, 0, 0]
+    learnt = MultiViewPredictorCorrector.learnt()
+    assert [learnt.gamma_at(level) for level in levels] == [0, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5]
 
 
 def mvpc_covariance(prior, sampler):
@@ -78,7 +82,7 @@ def mvpc_covariance(prior, sampler):
         return denoiser.denoise(unit, schedule.alpha_bar[t]).reshape(n, n).T
 
     def noise(t):
-        power = sampler.gamma if sigma[t] >= sampler.gamma_from else 0.0
+        power = sampler.gamma_at(sigma[t])
         return np.kron(np.eye(n // 3), (vectors * values**power) @ vectors.T)
 
     def grown(covariance, move, added):
@@ -167,6 +171,25 @@ def test_the_corrector_preserves_the_pool_of_the_views(gaussian_motion):
         after = move @ pool @ move.T + 2 * size * (1 - alpha_bar) * spread
         errors.append(abs(after - pool).max())
     assert errors[0] == pytest.approx(4 * errors[1], rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("direction", "with_gamma_0", "with_gamma_1"), [((1, 1, 1), 2 / 3, 1.0), ((1, 0, 0), 1.0, 1.5)]
+)
+def test_gamma_1_counts_directions_seen_by_all_views_once(
+    gaussian_motion, direction, with_gamma_0, with_gamma_1
+):
+    """The corrector's variance along a diagonal is right with γ = 1, along an axis with γ = 0."""
+    u = np.array(direction) / np.linalg.norm(direction)
+    prior = gaussian_motion(np.zeros((1, 1, 3)), np.outer(u, u) + 1e-9 * np.eye(3))
+    views = view_sets(prior, 3, None)[0]
+    alpha_bar = 1 - 1e-6
+    denoised = MultiViewDenoiser(prior, views).denoise(np.eye(3).reshape(3, 1, 1, 3), alpha_bar)
+    drift = math.sqrt(alpha_bar) * denoised.reshape(3, 3).T - np.eye(3)
+    for gamma, expected in ((0, with_gamma_0), (1, with_gamma_1)):
+        noise = symmetric_power(views.n_views * np.linalg.inv(views.gram), gamma)
+        stationary = solve_continuous_lyapunov(drift, -2 * (1 - alpha_bar) * noise)
+        assert u @ stationary @ u == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize("elevation", [0.0, 0.2])
