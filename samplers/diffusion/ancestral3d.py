@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import ClassVar
 
 from probmotion.posteriors.posterior import MotionPosterior
@@ -34,7 +35,8 @@ class Ancestral3D(AncestralSampler):
     integrator : AnyIntegrator
         Integrator of the reverse diffusion.
     guidance : AnyGuidance
-        Method of conditioning on the observations.
+        Method of conditioning on the observations. The covariance of a 3D denoiser has several
+        large eigenvalues, which take more conjugate-gradient steps than the default of guidance.
     batch : int
         Maximum batch size; does not affect the draws.
     """
@@ -46,7 +48,7 @@ class Ancestral3D(AncestralSampler):
     steps: int = 50
     levels: AnyLevels = field(default_factory=LogSNR)
     integrator: AnyIntegrator = field(default_factory=SecondOrderSDE)
-    guidance: AnyGuidance = field(default_factory=MomentMatched)
+    guidance: AnyGuidance = field(default_factory=partial(MomentMatched, steps=12))
     batch: int = 256
 
     def _state(self, posterior: MotionPosterior) -> MotionState:
