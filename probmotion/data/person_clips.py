@@ -2,13 +2,16 @@
 
 ``person_clips.csv`` lists the action and the part of each clip:
 
-- ``test``: the test clips of the earlier splits (``WALK_CLIPS``, ``DENOISING_CLIPS``), and seven
-  clips of ``cmu_actions``
-- ``validation``: the other validation clips of the denoising study, and nine clips of
-  ``cmu_actions``
+- ``test``: the test clips of the earlier splits (``WALK_CLIPS``, ``DENOISING_CLIPS``), and the
+  clips of ``cmu_actions`` whose number is a multiple of five
+- ``validation``: the other validation clips of the denoising study, and the clips of
+  ``cmu_actions`` before those of its test part
 - ``unseen``: all clips of one action, soccer, which is in no other part
 - ``excluded``: two excerpts of other clips, and a clip shorter than a second
 - ``train``: all others
+
+The column ``corrector`` has the parts of ``cmu_actions`` in the training of ``joint-corrector``,
+which differ, as it was trained before this split.
 """
 
 from __future__ import annotations
@@ -72,21 +75,22 @@ def moving_clips(folder: str | Path) -> dict[str, list[Motion]]:
 
 
 def action_clips(folder: str | Path) -> dict[str, list[Motion]]:
-    """Return the clips of ``cmu_actions`` by part, on ``person14`` at 30 fps.
+    """Return the clips of ``cmu_actions`` by their part in the training of ``joint-corrector``.
 
-    The prior ``cmu-motion`` was fitted to all of them but the unseen ones; who uses the validation
-    and test parts fits a prior to the training part. ``folder`` and errors are those of
+    Motions are on ``person14`` at 30 fps.
+    The prior ``cmu-motion`` was fitted to all of them but soccer, a part of its own; who uses the
+    validation and test parts fits a prior to the training part. ``folder`` and errors are those of
     :func:`moving_clips`.
     """
     with _TABLE.open(encoding="utf-8", newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["clip"].startswith("cmu_actions/")]
+        rows = [row for row in csv.DictReader(file) if row["corrector"]]
     return {
         part: [
             on_person(load(Path(folder) / f"{row['clip']}.npz")).resample(_FPS)
             for row in rows
-            if row["part"] == part
+            if row["corrector"] == part
         ]
-        for part in (*LEARNT_PARTS, "unseen")
+        for part in (*LEARNT_PARTS, "soccer")
     }
 
 

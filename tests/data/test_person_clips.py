@@ -31,10 +31,15 @@ def test_earlier_test_clips_stay_test_clips(rows):
     assert {*DENOISING_CLIPS["train"]} <= of_part(rows, "train")
 
 
-def test_one_action_is_in_no_other_part(rows):
+def test_one_action_is_in_no_other_part_and_others_have_every_fifth_clip_as_test(rows):
     unseen = {row["action"] for row in rows if row["part"] == "unseen"}
     assert unseen == {"soccer"}
     assert not unseen & {row["action"] for row in rows if row["part"] in LEARNT_PARTS}
+    parts = {0: "test", 4: "validation"}
+    for row in rows:
+        if row["clip"].startswith("cmu_actions/") and row["action"] not in unseen:
+            number = int(row["clip"].rpartition("_")[2])
+            assert row["part"] == parts.get(number % 5, "train"), row["clip"]
     for action in ("walking", "running", "jumping"):
         clips = clips_of_actions(action)
         assert tuple(clips) == LEARNT_PARTS
@@ -61,11 +66,11 @@ def test_moving_clips_have_no_marker_jumps(real_data):
         assert speed < 9, clip.name
 
 
-def test_actions_are_split_and_soccer_is_unseen(real_data):
+def test_actions_of_the_corrector_are_split_and_soccer_is_kept_out(real_data):
     parts = action_clips(real_data)
-    assert {part for part in parts for clip in parts[part] if "soccer" in clip.name} == {"unseen"}
+    assert {part for part in parts for clip in parts[part] if "soccer" in clip.name} == {"soccer"}
     assert {(clip.skeleton, clip.fps) for part in parts.values() for clip in part} == {
         (Skeleton.preset("person14"), 30.0)
     }
     frames = {part: sum(clip.frames for clip in clips) for part, clips in parts.items()}
-    assert frames == {"train": 8629, "validation": 2727, "test": 1353, "unseen": 689}
+    assert frames == {"train": 8629, "validation": 2727, "test": 1353, "soccer": 689}

@@ -63,11 +63,12 @@ EQUAL_COST = (MultiViewPredictorCorrector(), MultiViewAncestral(steps=95))
 def test_mvpc_is_more_accurate_than_mas_on_a_few_draws():
     """This is the fast version of the slow test below, in reduced coordinates."""
     reduced, _ = gaits().reduced()
-    mvpc, mas = (metrics(reduced, sampler, [0], 100) for sampler in EQUAL_COST)
-    assert mvpc["calls"] == 474
-    assert mas["calls"] == 475
+    mvpc, mas = (metrics(reduced, sampler, [0, 1], 100) for sampler in EQUAL_COST)
+    assert set(mvpc["calls"]) == {474}
+    assert set(mas["calls"]) == {475}
     for name in ("swd_ratio", "off_manifold_ratio", "variance_ratio"):
-        assert abs(np.log(mvpc[name])) < abs(np.log(mas[name])) - 0.1, name
+        gaps = [abs(np.log(values[name].mean())) for values in (mvpc, mas)]
+        assert gaps[0] < gaps[1] - 0.1, name
 
 
 @pytest.mark.slow
