@@ -165,7 +165,7 @@ STUDIES = {
             "mas, 100 levels, karras": MultiViewAncestral(
                 perspective=True, levels=Karras(smallest=0.026), integrator=SecondOrderSDE()
             ),
-            "mvpc, 97 levels, karras": MultiViewPredictorCorrector(gamma=0.5, gamma_to=None),
+            "mvpc, 97 levels, karras": MultiViewPredictorCorrector(gamma=0.5),
         },
     ),
     "conditioning": Study(
@@ -205,27 +205,20 @@ STUDIES = {
         "noise covariance and corrector of mvpc, at 474 evaluations",
         ("gait", "cmu", "quadruped"),
         {
-            f"gamma {gamma:g} from {start:g} to {end}, corrector {size:g}": (
-                MultiViewPredictorCorrector(
-                    steps=97 if size else 158,
-                    corrector_steps=1 if size else 0,
-                    corrector_size=size or 1.0,
-                    gamma=gamma,
-                    gamma_from=start,
-                    gamma_to=end,
+            "default": MultiViewPredictorCorrector(),
+            "no corrector": MultiViewPredictorCorrector(steps=158, corrector_steps=0),
+            **{
+                f"gamma {gamma:g} from {start:g}, corrector {size:g}": (
+                    MultiViewPredictorCorrector(corrector_size=size, gamma=gamma, gamma_from=start)
                 )
-            )
-            for gamma, start, end, size in (
-                (0, 1, None, 0),
-                (0.6, 0.2, None, 0),
-                (1, 1, None, 0),
-                (1, 1, 4, 0),
-                (0, 1, None, 0.6),
-                (0.5, 1, None, 0.6),
-                (0.55, 0.2, None, 0.15),
-                (1, 1, 3, 0.6),
-                (1, 1, 4, 0.6),
-            )
+                for gamma, start, size in (
+                    (0, 1, 0.6),
+                    (0.5, 1, 0.6),
+                    (1, 1, 0.6),
+                    (0.5, 0.2, 0.3),
+                    (0.55, 0.2, 0.15),
+                )
+            },
         },
     ),
     "chains": Study(

@@ -64,7 +64,7 @@ FREEDOM = "degrees_of_freedom must be a number above 0 or inf"
         (MultiViewPredictorCorrector, {"corrector_size": 1.5}, "corrector_size must be at most 1"),
         (MultiViewPredictorCorrector, {"corrector_steps": -1}, f"corrector_steps {COUNT} 0"),
         (MultiViewPredictorCorrector, {"gamma_from": math.nan}, f"gamma_from {FROM_0}"),
-        (MultiViewPredictorCorrector, {"gamma_to": -1.0}, f"gamma_to {FROM_0}"),
+        (MultiViewPredictorCorrector, {"gamma": -1.0}, f"gamma {FROM_0}"),
         (ScoreDistillation, {"levels": "falling"}, "levels must be one of uniform, annealed, got"),
         (ScoreDistillation, {"weighting": "none"}, "weighting must be one of constant, variance,"),
         (ScoreDistillation, {"azimuths": 2, "n_views": 3}, f"azimuths {COUNT} 3"),

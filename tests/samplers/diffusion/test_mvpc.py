@@ -62,6 +62,8 @@ def test_gamma_by_noise_level():
     levels = (0.01, 0.5, 0.999, 1.0, 3.999, 4.0, 50.0)
     sampler = MultiViewPredictorCorrector()
     assert [sampler.gamma_at(level) for level in levels] == [0, 0, 0, 1, 1, 0, 0]
+    guided = [sampler.gamma_at(level, observed=True) for level in levels]
+    assert guided == [0, 0, 0, 0.5, 0.5, 0.5, 0.5]
     learnt = MultiViewPredictorCorrector.learnt()
     assert [learnt.gamma_at(level) for level in levels] == [0, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5]
 
@@ -126,7 +128,7 @@ def mvpc_covariance(prior, sampler):
     [
         {"corrector_steps": 0, "gamma": 0.8},
         {"corrector_steps": 2},
-        {"levels": Cosine(), "integrator": DDPM()},
+        {"levels": Cosine(), "integrator": DDPM(), "gamma": 0.5},
         {"elevation": 0.3},
     ],
 )
