@@ -35,8 +35,8 @@ class Ancestral3D(AncestralSampler):
     integrator : AnyIntegrator
         Integrator of the reverse diffusion.
     guidance : AnyGuidance
-        Method of conditioning on the observations. The covariance of a 3D denoiser has several
-        large eigenvalues, which take more conjugate-gradient steps than the default of guidance.
+        Method of conditioning on the observations; by default moment matching with 12
+        conjugate-gradient steps, as the covariance of a 3D denoiser has several large eigenvalues.
     batch : int
         Maximum batch size; does not affect the draws.
     """

@@ -13,13 +13,12 @@ exact denoisers, which alternate between levels, cover the sphere
 preconditioned by Λ with stationary density Π_v p_v(P_v X)^(1/V), the logarithmic pool of the noisy
 2D marginals. For γ = 0 and views that weight all directions equally, it is Π_v p_v(P_v X)^(3/2V).
 
-What two thirds of the coordinates, a view, say of a common mode is thus counted once with γ = 1 and
-one and a half times with γ = 0, which has too little variance. The noise of single coordinates is
-counted two thirds of a time with γ = 1 and once with γ = 0, which is exact for an isotropic
-Gaussian. By default, γ is therefore 1 at the noise levels at which shared directions of motion are
-determined, and 0 below. Above them, it is 0 as well: a large displacement along one axis is seen
-whole by the views across it, and γ = 1 would draw too many of these motions. Observations, too,
-determine directions of motion; with them, more draws end in a wrong mode than with γ = ½.
+Each view has two thirds of the coordinates. A direction of motion that all views see equally is
+counted once with γ = 1 and one and a half times with γ = 0, so that its variance is too small.
+Noise of single coordinates is counted two thirds of a time with γ = 1 and once with γ = 0; γ = 0 is
+therefore exact for an isotropic Gaussian. By default, γ is 1 at the noise levels at which most of
+the variance is determined, and 0 below and above, where it would add variance. With observations,
+more draws would end in a wrong mode; γ is ½ at all high noise levels.
 """
 
 from __future__ import annotations
@@ -45,6 +44,8 @@ from probmotion.validation import check_count, check_positive
 
 __all__ = ["MultiViewPredictorCorrector"]
 
+GAMMA_BELOW = 4.0  # noise level σ from which the default γ is 0 without observations
+
 
 @dataclass(frozen=True)
 class MultiViewPredictorCorrector(AncestralSampler):
@@ -65,8 +66,8 @@ class MultiViewPredictorCorrector(AncestralSampler):
         Elevation of these views, radians; by default that of the prior's training. Exact denoisers
         hold for any view, and by default alternate between five sets of three orthogonal views.
     gamma : float, optional
-        Exponent γ at high noise, at least 0. By default ½ with observations; without, 1 below four
-        times ``gamma_from`` and 0 above.
+        Exponent γ for σ ≥ ``gamma_from``, at least 0. By default ½ with observations; without, 1
+        for σ < 4 and 0 from there on.
     gamma_from : float
         Noise level σ below which γ is 0.
     corrected_from : float
@@ -114,7 +115,7 @@ class MultiViewPredictorCorrector(AncestralSampler):
 
     @classmethod
     def accurate(cls) -> MultiViewPredictorCorrector:
-        """Return a sampler with a smaller error at three times the default cost."""
+        """Return a sampler of three times the cost, with a smaller error on recorded motion."""
         return cls(steps=200, corrector_steps=2, corrector_size=0.4)
 
     @classmethod
@@ -142,7 +143,7 @@ class MultiViewPredictorCorrector(AncestralSampler):
             return self.gamma
         if observed:
             return 0.5
-        return 1.0 if level < 4 * self.gamma_from else 0.0
+        return 1.0 if level < GAMMA_BELOW else 0.0
 
     def _state(self, posterior: MotionPosterior) -> State:
         prior = posterior.prior

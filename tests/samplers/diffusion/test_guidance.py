@@ -83,6 +83,16 @@ def test_exactly_guided_draws_are_those_of_the_posterior(gaussian, keypoints):
     np.testing.assert_allclose(guided, direct, atol=1e-8)
 
 
+def test_default_gamma_depends_on_the_observations(gaussian, keypoints):
+    for likelihood, gamma in ((None, None), (keypoints, 0.5)):
+        posterior = MotionPosterior(gaussian, likelihood)
+        default, half = (
+            MultiViewPredictorCorrector(gamma=value).sample(posterior, draws=2, progress=False)
+            for value in (None, 0.5)
+        )
+        assert np.array_equal(default.flat(), half.flat()) == (gamma == 0.5)
+
+
 def test_multi_view_covariance_is_the_symmetrised_jacobian(gaussian):
     views = Views(Cameras.ring(3, elevation=0.5), (2.0, 1.0, 1.0))
     denoiser = MultiViewDenoiser(gaussian, views)

@@ -128,7 +128,7 @@ def mvpc_covariance(prior, sampler):
     [
         {"corrector_steps": 0, "gamma": 0.8},
         {"corrector_steps": 2},
-        {"levels": Cosine(), "integrator": DDPM(), "gamma": 0.5},
+        {"levels": Cosine(), "integrator": DDPM()},
         {"elevation": 0.3},
     ],
 )
