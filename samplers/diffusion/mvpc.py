@@ -115,7 +115,7 @@ class MultiViewPredictorCorrector(AncestralSampler):
 
     @classmethod
     def accurate(cls) -> MultiViewPredictorCorrector:
-        """Return a sampler of three times the cost, with a smaller error on recorded motion."""
+        """Return a sampler with more levels and smaller corrector steps, at triple the cost."""
         return cls(steps=200, corrector_steps=2, corrector_size=0.4)
 
     @classmethod

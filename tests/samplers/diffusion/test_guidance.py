@@ -73,10 +73,7 @@ def test_exactly_guided_draws_are_those_of_the_posterior(gaussian, keypoints):
     guided, direct = (
         sampler.sample(posterior, draws=40, seed=5, progress=False).flat()
         for sampler, posterior in (
-            (
-                Ancestral3D(steps=40, guidance=MomentMatched(16)),
-                MotionPosterior(gaussian, keypoints),
-            ),
+            (Ancestral3D(steps=40), MotionPosterior(gaussian, keypoints)),
             (Ancestral3D(steps=40), MotionPosterior(conditioned)),
         )
     )
