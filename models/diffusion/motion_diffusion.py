@@ -159,25 +159,30 @@ class MotionDiffusion(TrackNetwork):
             clean[rows] = _numbers(denoised, x_t)[: len(clean[rows])]
         return clean
 
-    def view_covariance_product(
-        self, x_t: np.ndarray, alpha_bar: float, cameras: Cameras, vectors: np.ndarray
-    ) -> np.ndarray:
-        """Return (1−ᾱ)/√ᾱ Dᵀ v, with D the Jacobian of :meth:`denoise`; arrays (B, V, L, J, 2).
+    def view_covariance(
+        self, x_t: np.ndarray, alpha_bar: float, cameras: Cameras
+    ) -> Callable[[np.ndarray], np.ndarray]:
+        """Return v ↦ (1−ᾱ)/√ᾱ Dᵀ v, D the Jacobian of :meth:`denoise`; arrays (B, V, L, J, 2).
 
         For the exact denoiser, the product is Cov[x₀ | x_t] v (Tweedie). The Jacobian of a network
         is only approximately symmetric.
         """
         self._check(x_t)
-        check_shape("vectors", vectors, x_t.shape)
         network = self._network_at(alpha_bar)
         factor = (1 - alpha_bar) / math.sqrt(alpha_bar)
-        product = np.empty_like(vectors)
-        chunks = zip(self._chunks(x_t), self._chunks(vectors), strict=True)
-        for (rows, chunk), (_, vector) in chunks:
-            with torch.enable_grad():
-                point = chunk.requires_grad_()
-                (pulled,) = torch.autograd.grad(network(point), point, vector)
-            product[rows] = factor * _numbers(pulled, vectors)[: len(product[rows])]
+
+        def product(vectors: np.ndarray) -> np.ndarray:
+            check_shape("vectors", vectors, x_t.shape)
+            out = np.empty_like(vectors)
+            # Evaluate the network again for each product: activations of all chunks are gigabytes.
+            chunks = zip(self._chunks(x_t), self._chunks(vectors), strict=True)
+            for (rows, chunk), (_, vector) in chunks:
+                with torch.enable_grad():
+                    point = chunk.requires_grad_()
+                    (pulled,) = torch.autograd.grad(network(point), point, vector)
+                out[rows] = factor * _numbers(pulled, vectors)[: len(out[rows])]
+            return out
+
         return product
 
     def check_observations(self, likelihood: Likelihood) -> None:

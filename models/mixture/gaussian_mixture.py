@@ -7,7 +7,7 @@ yaw that is uniform on a grid of A azimuths. The mixture thus has K·A Gaussian 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
@@ -270,19 +270,25 @@ class GaussianMixtureMotion:
             out[:, view] = mixture.denoise(flat, alpha_bar).reshape(out[:, view].shape)
         return out
 
-    def view_covariance_product(
-        self, x_t: np.ndarray, alpha_bar: float, cameras: Cameras, vectors: np.ndarray
-    ) -> np.ndarray:
-        """Return Cov[x₀ | x_t] v for each view, all arrays (B, V, L, J, 2)."""
-        out = np.empty_like(vectors)
-        for view, mixture in enumerate(self._view_mixtures(cameras, x_t)):
-            noisy, flat = (
-                np.ascontiguousarray(values[:, view]).reshape(len(x_t), mixture.dim)
-                for values in (x_t, vectors)
-            )
-            product = mixture.covariance_product(noisy, alpha_bar, flat)
-            out[:, view] = product.reshape(out[:, view].shape)
-        return out
+    def view_covariance(
+        self, x_t: np.ndarray, alpha_bar: float, cameras: Cameras
+    ) -> Callable[[np.ndarray], np.ndarray]:
+        """Return v ↦ Cov[x₀ | x_t] v for each view, arrays (B, V, L, J, 2)."""
+        mixtures = self._view_mixtures(cameras, x_t)
+        rows = (len(x_t), mixtures[0].dim)
+        covariances = [
+            mixture.covariance(np.ascontiguousarray(x_t[:, view]).reshape(rows), alpha_bar)
+            for view, mixture in enumerate(mixtures)
+        ]
+
+        def product(vectors: np.ndarray) -> np.ndarray:
+            out = np.empty_like(vectors)
+            for view, covariance in enumerate(covariances):
+                flat = np.ascontiguousarray(vectors[:, view]).reshape(rows)
+                out[:, view] = covariance(flat).reshape(out[:, view].shape)
+            return out
+
+        return product
 
     def denoise_motion(self, x_t: np.ndarray, alpha_bar: float) -> np.ndarray:
         """Return E[X₀ | X_t]: ``(B, L, J, 3) → (B, L, J, 3)``, normalised units."""
@@ -290,17 +296,19 @@ class GaussianMixtureMotion:
         flat = x_t.reshape(len(x_t), self._normalised.dim)
         return self._normalised.denoise(flat, alpha_bar).reshape(x_t.shape)
 
-    def motion_covariance_product(
-        self, x_t: np.ndarray, alpha_bar: float, vectors: np.ndarray
-    ) -> np.ndarray:
-        """Return Cov[X₀ | X_t] v, all arrays (B, L, J, 3), normalised units."""
+    def motion_covariance(
+        self, x_t: np.ndarray, alpha_bar: float
+    ) -> Callable[[np.ndarray], np.ndarray]:
+        """Return v ↦ Cov[X₀ | X_t] v, arrays (B, L, J, 3), normalised units."""
         check_shape("x_t", x_t, ("B", *self.means.shape[1:]))
-        check_shape("vectors", vectors, x_t.shape)
         rows = (len(x_t), self._normalised.dim)
-        product = self._normalised.covariance_product(
-            x_t.reshape(rows), alpha_bar, vectors.reshape(rows)
-        )
-        return product.reshape(x_t.shape)
+        covariance = self._normalised.covariance(x_t.reshape(rows), alpha_bar)
+
+        def product(vectors: np.ndarray) -> np.ndarray:
+            check_shape("vectors", vectors, x_t.shape)
+            return covariance(vectors.reshape(rows)).reshape(x_t.shape)
+
+        return product
 
     # Properties specific to the mixture.
 

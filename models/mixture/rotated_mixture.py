@@ -12,7 +12,7 @@ reduce to products with 3·K·(1 + r) base fields, combined per azimuth.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -119,21 +119,28 @@ class RotatedMixture:
             np.add(means[:n], noise_factor * x[rows], out=out[rows])
         return out
 
-    def covariance_product(self, x: np.ndarray, alpha_bar: float, v: np.ndarray) -> np.ndarray:
-        """Return Cov[x₀ | x_t] v for each row: ``(n, D), (n, D) → (n, D)``."""
+    def covariance(self, x: np.ndarray, alpha_bar: float) -> Callable[[np.ndarray], np.ndarray]:
+        """Return v ↦ Cov[x₀ | x_t] v for each row of x_t: ``(n, D) → (n, D)``."""
         level = self._level(alpha_bar)
-        out = np.empty_like(v)
+        states = []
         for rows, n in _blocks(len(x)):
             weight, latent = self._condition(_filled(x[rows]), level)
             latent *= level.signal / level.total
-            on_mean, on_latent = self._products(_filled(v[rows]), level, shifted=False)
-            clean = on_mean + np.einsum("karn,karn->kan", latent, on_latent)
-            weighted = weight * (clean - (weight * clean).sum(axis=(0, 1)))
-            on_latent *= weight[:, :, None]
-            on_latent += latent * weighted[:, :, None]
-            product = np.matmul(*self._combined(weighted, on_latent, 1.0, level))[:n]
-            out[rows] = level.shrink**2 * product + self.variance * level.shrink * v[rows]
-        return out
+            states.append((rows, n, weight, latent))
+
+        def product(v: np.ndarray) -> np.ndarray:
+            out = np.empty_like(v)
+            for rows, n, weight, latent in states:
+                on_mean, on_latent = self._products(_filled(v[rows]), level, shifted=False)
+                clean = on_mean + np.einsum("karn,karn->kan", latent, on_latent)
+                weighted = weight * (clean - (weight * clean).sum(axis=(0, 1)))
+                on_latent *= weight[:, :, None]
+                on_latent += latent * weighted[:, :, None]
+                signal = np.matmul(*self._combined(weighted, on_latent, 1.0, level))[:n]
+                out[rows] = level.shrink**2 * signal + self.variance * level.shrink * v[rows]
+            return out
+
+        return product
 
     def responsibilities(self, x: np.ndarray) -> np.ndarray:
         """Return p(k, a | x₀) for clean points: ``(n, D) → (n, K, A)``."""

@@ -13,7 +13,7 @@ from a 3×3 matrix of weights: the cost does not depend on the number of azimuth
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -139,25 +139,31 @@ class RotatedSpectra:
             out[rows] = mean[: rows.stop - rows.start]
         return out
 
-    def covariance_product(self, y: np.ndarray, variance: float, vectors: np.ndarray) -> np.ndarray:
-        """Return Cov[X | y] u for each row: arrays (n, L, J, 3)."""
+    def covariance(self, y: np.ndarray, variance: float) -> Callable[[np.ndarray], np.ndarray]:
+        """Return u ↦ Cov[X | y] u for each row of y: arrays (n, L, J, 3)."""
         level = self._level(variance)
-        out = np.empty_like(vectors)
-        bases, turned = self._space(), self._space()
         no_means, own = np.zeros_like(self._means), self._spectra * level.precision
-        for (rows, block), (_, directions) in zip(blocks(y), blocks(vectors), strict=True):
-            self._bases(block, self._means, bases)
-            weights = self._responsibilities(bases, level)
-            self._bases(directions, no_means, turned)
-            # Products of (y − E[X | y, k, s, a]) / v with the vectors, from 3×3 matrices.
-            products = self._products(bases, turned, level.precision)
-            centred = products - (weights * products).sum(axis=(1, 2, 3), keepdims=True)
-            between = self._weighted(bases, level.precision, weights * centred)
-            # A component's own covariance is v λ / (λ + v) in each direction.
-            within = self._weighted(turned, own, weights)
-            total = variance**2 * between + variance * within
-            out[rows] = total[: rows.stop - rows.start]
-        return out
+        states = []
+        for _, block in blocks(y):
+            bases = self._bases(block, self._means, self._space())
+            states.append((bases, self._responsibilities(bases, level)))
+        turned = self._space()
+
+        def product(vectors: np.ndarray) -> np.ndarray:
+            out = np.empty_like(vectors)
+            for (rows, directions), (bases, weights) in zip(blocks(vectors), states, strict=True):
+                self._bases(directions, no_means, turned)
+                # Products of (y − E[X | y, k, s, a]) / v with the vectors, from 3×3 matrices.
+                products = self._products(bases, turned, level.precision)
+                centred = products - (weights * products).sum(axis=(1, 2, 3), keepdims=True)
+                between = self._weighted(bases, level.precision, weights * centred)
+                # A component's own covariance is v λ / (λ + v) in each direction.
+                within = self._weighted(turned, own, weights)
+                total = variance**2 * between + variance * within
+                out[rows] = total[: rows.stop - rows.start]
+            return out
+
+        return product
 
     def responsibilities(self, x: np.ndarray) -> np.ndarray:
         """Return p(k, s, a | X): ``(n, L, J, 3) → (n, K, S, A)``."""

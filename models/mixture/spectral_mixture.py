@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -344,18 +344,24 @@ class SpectralMixtureMotion:
             out[:, view] = from_frequencies(mixture.denoise(noisy, variance), axis=1)
         return out / self.scale
 
-    def view_covariance_product(
-        self, x_t: np.ndarray, alpha_bar: float, cameras: Cameras, vectors: np.ndarray
-    ) -> np.ndarray:
-        """Return Cov[x₀ | x_t] v for each view, all arrays (B, V, L, J, 2)."""
-        out = np.empty_like(vectors)
+    def view_covariance(
+        self, x_t: np.ndarray, alpha_bar: float, cameras: Cameras
+    ) -> Callable[[np.ndarray], np.ndarray]:
+        """Return v ↦ Cov[x₀ | x_t] v for each view, arrays (B, V, L, J, 2)."""
         factor, variance = self._noise(alpha_bar)
-        for view, mixture in enumerate(self._view_mixtures(cameras, x_t)):
-            noisy = to_frequencies(factor * x_t[:, view], axis=1)
-            turned = to_frequencies(vectors[:, view], axis=1)
-            product = mixture.covariance_product(noisy, variance, turned)
-            out[:, view] = from_frequencies(product, axis=1)
-        return out / self.scale**2
+        covariances = [
+            mixture.covariance(to_frequencies(factor * x_t[:, view], axis=1), variance)
+            for view, mixture in enumerate(self._view_mixtures(cameras, x_t))
+        ]
+
+        def product(vectors: np.ndarray) -> np.ndarray:
+            out = np.empty_like(vectors)
+            for view, covariance in enumerate(covariances):
+                turned = to_frequencies(vectors[:, view], axis=1)
+                out[:, view] = from_frequencies(covariance(turned), axis=1)
+            return out / self.scale**2
+
+        return product
 
     def denoise_motion(self, x_t: np.ndarray, alpha_bar: float) -> np.ndarray:
         """Return E[X₀ | X_t]: ``(B, L, J, 3) → (B, L, J, 3)``, normalised units."""
@@ -364,16 +370,21 @@ class SpectralMixtureMotion:
         noisy = to_frequencies(factor * x_t, axis=1)
         return from_frequencies(self._spectra_mixture.denoise(noisy, variance), axis=1) / self.scale
 
-    def motion_covariance_product(
-        self, x_t: np.ndarray, alpha_bar: float, vectors: np.ndarray
-    ) -> np.ndarray:
-        """Return Cov[X₀ | X_t] v, all arrays (B, L, J, 3), normalised units."""
+    def motion_covariance(
+        self, x_t: np.ndarray, alpha_bar: float
+    ) -> Callable[[np.ndarray], np.ndarray]:
+        """Return v ↦ Cov[X₀ | X_t] v, arrays (B, L, J, 3), normalised units."""
         check_shape("x_t", x_t, ("B", *self._means.shape[1:]))
-        check_shape("vectors", vectors, x_t.shape)
         factor, variance = self._noise(alpha_bar)
-        noisy, turned = to_frequencies(factor * x_t, axis=1), to_frequencies(vectors, axis=1)
-        product = self._spectra_mixture.covariance_product(noisy, variance, turned)
-        return from_frequencies(product, axis=1) / self.scale**2
+        noisy = to_frequencies(factor * x_t, axis=1)
+        covariance = self._spectra_mixture.covariance(noisy, variance)
+
+        def product(vectors: np.ndarray) -> np.ndarray:
+            check_shape("vectors", vectors, x_t.shape)
+            turned = to_frequencies(vectors, axis=1)
+            return from_frequencies(covariance(turned), axis=1) / self.scale**2
+
+        return product
 
     # Properties specific to the mixture.
 

@@ -6,6 +6,8 @@ frequency: each has a covariance matrix over the 2 J image coordinates, decompos
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from probmotion.models.mixture.conditioning import Components, rotation
@@ -59,22 +61,28 @@ class ViewSpectra:
             out[rows] = mean[:n].reshape(n, *y.shape[1:])
         return out
 
-    def covariance_product(self, y: np.ndarray, variance: float, vectors: np.ndarray) -> np.ndarray:
-        """Return Cov[x | y] u for each row: arrays (n, L, J, 2)."""
-        out = np.empty_like(vectors)
-        for (rows, block), (_, direction) in zip(blocks(y), blocks(vectors), strict=True):
+    def covariance(self, y: np.ndarray, variance: float) -> Callable[[np.ndarray], np.ndarray]:
+        """Return u ↦ Cov[x | y] u for each row of y: arrays (n, L, J, 2)."""
+        gains = variance * self._sizes / (self._sizes + variance)
+        states = []
+        for _, block in blocks(y):
             weights, means = self._condition(block, variance)
-            flat = direction.reshape(len(direction), *self._means.shape[1:])
             mean = np.sum([weights[c, :, None, None] * part for c, part in means], axis=0)
-            total = np.zeros_like(flat)
-            for c, part in means:
-                gain = variance * self._sizes[c] / (self._sizes[c] + variance)
-                along = (part - mean) * ((part - mean) * flat).sum(axis=(1, 2), keepdims=True)
-                own = self._product(c, gain, flat)
-                total += weights[c, :, None, None] * (own + along)
-            n = rows.stop - rows.start
-            out[rows] = total[:n].reshape(n, *vectors.shape[1:])
-        return out
+            states.append([(c, weights[c, :, None, None], part - mean) for c, part in means])
+
+        def product(vectors: np.ndarray) -> np.ndarray:
+            out = np.empty_like(vectors)
+            for (rows, direction), state in zip(blocks(vectors), states, strict=True):
+                flat = direction.reshape(len(direction), *self._means.shape[1:])
+                total = np.zeros_like(flat)
+                for c, weight, away in state:
+                    along = away * (away * flat).sum(axis=(1, 2), keepdims=True)
+                    total += weight * (self._product(c, gains[c], flat) + along)
+                n = rows.stop - rows.start
+                out[rows] = total[:n].reshape(n, *vectors.shape[1:])
+            return out
+
+        return product
 
     def _condition(
         self, block: np.ndarray, variance: float

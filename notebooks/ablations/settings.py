@@ -24,6 +24,7 @@ from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.problem import Problem
 from probmotion.posteriors.sampling import Sampler
 from probmotion.problems import load_problem
+from probmotion.problems.conditioned import conditioned
 from probmotion.samplers import (
     NUTS,
     Ancestral3D,
@@ -53,6 +54,7 @@ from probmotion.seeds import NormalStreams
 
 CONDITIONED = (
     "gait-monocular", "gait-occluded", "gait-sparse", "cmu-monocular", "quadruped-monocular",
+    "cmu-motion-monocular", "cmu-motion-occluded", "cmu-motion-denoise", "salsa-lifted",
 )  # fmt: skip
 BUDGETS = (500, 2000, 8000)
 """Denoiser evaluations a draw."""
@@ -88,6 +90,16 @@ class MirroredSampler(ExactSampler):
         return Batches(draw, size=1)
 
 
+@dataclass(frozen=True)
+class ExactlyGuided(Ancestral3D):
+    """Diffusion sampling with the exact denoiser of the posterior: errors are the integrator's."""
+
+    name: ClassVar[str] = "exactly-guided"
+
+    def _batches(self, posterior: MotionPosterior, seed: int, progress: bool) -> Batches:
+        return super()._batches(conditioned(posterior), seed, progress)
+
+
 def conditional_methods(budget: int) -> dict[str, Sampler]:
     """Return methods of conditioning 2D denoisers, at a number of evaluations a draw."""
     # Exact denoisers have three views at a time, those of `mas` five.
@@ -114,13 +126,14 @@ def conditional_methods(budget: int) -> dict[str, Sampler]:
 STUDIES = {
     "integrators": Study(
         "integrators and noise levels at 50 evaluations of a 3D denoiser",
-        ("gait", "cmu", "quadruped", *CONDITIONED),
+        ("gait", "cmu", "quadruped", "cmu-motion", *CONDITIONED),
         {
             "ddpm, cosine": Ancestral3D(levels=Cosine(), integrator=DDPM()),
             "second order, cosine": Ancestral3D(levels=Cosine()),
             "second order, karras": Ancestral3D(levels=Karras()),
             "second order, log-snr": Ancestral3D(),
             "second order, log-snr, guided in 6 steps": Ancestral3D(guidance=MomentMatched()),
+            "second order, log-snr, guided exactly": ExactlyGuided(),
             "heun, log-snr": Ancestral3D(steps=25, integrator=Heun()),
             "ddpm, log-snr": Ancestral3D(integrator=DDPM()),
         },

@@ -6,7 +6,7 @@ normalised units: metres divided by the prior's ``scale``.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -236,22 +236,22 @@ class DenoisesCoordinates(HasLogDensity, Protocol):
 
 @runtime_checkable
 class DenoiserCovariance2D(Protocol):
-    """Products with Cov[x₀ | x_t], which is the 2D denoiser's Jacobian times (1−ᾱ)/√ᾱ."""
+    """Cov[x₀ | x_t] as an operator, which is the 2D denoiser's Jacobian times (1−ᾱ)/√ᾱ."""
 
-    def view_covariance_product(
-        self, x_t: np.ndarray, alpha_bar: float, cameras: Cameras, vectors: np.ndarray
-    ) -> np.ndarray:
-        """Return Cov[x₀ | x_t] v for each view; all arrays (B, V, L, J, 2), normalised units."""
+    def view_covariance(
+        self, x_t: np.ndarray, alpha_bar: float, cameras: Cameras
+    ) -> Callable[[np.ndarray], np.ndarray]:
+        """Return v ↦ Cov[x₀ | x_t] v for each view; arrays (B, V, L, J, 2), normalised units."""
 
 
 @runtime_checkable
 class DenoiserCovariance3D(Protocol):
-    """Products with Cov[X₀ | X_t], which is the 3D denoiser's Jacobian times (1−ᾱ)/√ᾱ."""
+    """Cov[X₀ | X_t] as an operator, which is the 3D denoiser's Jacobian times (1−ᾱ)/√ᾱ."""
 
-    def motion_covariance_product(
-        self, x_t: np.ndarray, alpha_bar: float, vectors: np.ndarray
-    ) -> np.ndarray:
-        """Return Cov[X₀ | X_t] v; all arrays (B, L, J, 3), normalised units."""
+    def motion_covariance(
+        self, x_t: np.ndarray, alpha_bar: float
+    ) -> Callable[[np.ndarray], np.ndarray]:
+        """Return v ↦ Cov[X₀ | X_t] v; arrays (B, L, J, 3), normalised units."""
 
 
 class ExactPosterior(Protocol):

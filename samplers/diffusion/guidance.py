@@ -156,11 +156,11 @@ class MomentMatched:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the conditional mean and (y − A D)ᵀ (A C Aᵀ + W⁻¹)⁻¹ (y − A D), (B,)."""
         root = np.sqrt(observations.precision)[..., None]
+        covariance = denoiser.covariance(x_t, alpha_bar)
 
         def spread(entries: np.ndarray) -> np.ndarray:
             """Return C Aᵀ W^½ u."""
-            adjoint = observations.adjoint(root * entries)
-            return denoiser.covariance_product(x_t, alpha_bar, adjoint)
+            return covariance(observations.adjoint(root * entries))
 
         def whiten(motions: np.ndarray) -> np.ndarray:
             """Return W^½ A X."""
@@ -208,7 +208,7 @@ class DPS:
             length = np.sqrt((confidence * residual**2).sum(axis=(1, 2, 3, 4), keepdims=True))
             adjoint = observations.adjoint(confidence * residual / np.maximum(length, 1e-300))
             # ∇‖y − A D‖ = −Jᵀ Aᵀ (y − A D)/‖y − A D‖ with J = √ᾱ/(1−ᾱ) M^(-½) C M^(½).
-            product = denoiser.covariance_product(x_t, alpha_bar, adjoint @ inverse_half)
+            product = denoiser.covariance(x_t, alpha_bar)(adjoint @ inverse_half)
             gradient = -(np.sqrt(alpha_bar) / (1 - alpha_bar)) * (product @ half)
             # The estimate has weight step.clean in x_{t−1}, which must change by −ζ ∇.
             return clean - (self.step_size / step.clean) * gradient

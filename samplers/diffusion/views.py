@@ -7,7 +7,7 @@ motions are in normalised units.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -137,13 +137,16 @@ class MotionDenoiser:
         self.counts["denoiser"] += len(x_t)
         return self.prior.denoise_motion(x_t, alpha_bar)
 
-    def covariance_product(
-        self, x_t: np.ndarray, alpha_bar: float, vectors: np.ndarray
-    ) -> np.ndarray:
-        """Return the product of Cov[X₀ | X_t] and ``vectors``; all arrays are (B, L, J, 3)."""
+    def covariance(self, x_t: np.ndarray, alpha_bar: float) -> Callable[[np.ndarray], np.ndarray]:
+        """Return u ↦ Cov[X₀ | X_t] u; arrays are (B, L, J, 3)."""
         assert isinstance(self.prior, DenoiserCovariance3D)
-        _count(self.counts, "covariance", len(x_t))
-        return self.prior.motion_covariance_product(x_t, alpha_bar, vectors)
+        covariance = self.prior.motion_covariance(x_t, alpha_bar)
+
+        def product(vectors: np.ndarray) -> np.ndarray:
+            _count(self.counts, "covariance", len(vectors))
+            return covariance(vectors)
+
+        return product
 
 
 class MultiViewDenoiser:
@@ -169,20 +172,22 @@ class MultiViewDenoiser:
         noisy = self.views.project(x_t)
         return self.views.combine(self.prior.denoise(noisy, alpha_bar, self.views.cameras))
 
-    def covariance_product(
-        self, x_t: np.ndarray, alpha_bar: float, vectors: np.ndarray
-    ) -> np.ndarray:
-        """Return C u with C = M^(-½) (Σ_v w_v P_vᵀ Cov[x₀ | P_v X_t] P_v) M^(-½), u = ``vectors``.
+    def covariance(self, x_t: np.ndarray, alpha_bar: float) -> Callable[[np.ndarray], np.ndarray]:
+        """Return u ↦ C u with C = M^(-½) (Σ_v w_v P_vᵀ Cov[x₀ | P_v X_t] P_v) M^(-½).
 
         By Tweedie's formula the Jacobian of D times (1−ᾱ)/√ᾱ is M⁻¹ Σ_v w_v P_vᵀ Cov_v P_v, which
         is similar to the symmetric matrix C.
         """
         assert isinstance(self.prior, DenoiserCovariance2D)
-        _count(self.counts, "covariance", len(x_t) * self.views.n_views)
         noisy = self.views.project(x_t)
-        inside = self.views.project(vectors @ self._half)
-        product = self.prior.view_covariance_product(noisy, alpha_bar, self.views.cameras, inside)
-        return self.views.scatter(product) @ self._half
+        covariance = self.prior.view_covariance(noisy, alpha_bar, self.views.cameras)
+
+        def product(vectors: np.ndarray) -> np.ndarray:
+            _count(self.counts, "covariance", len(vectors) * self.views.n_views)
+            inside = self.views.project(vectors @ self._half)
+            return self.views.scatter(covariance(inside)) @ self._half
+
+        return product
 
     @cached_property
     def _half(self) -> np.ndarray:

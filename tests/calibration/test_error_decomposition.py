@@ -71,12 +71,12 @@ class Points:
         views = [self._denoise(P, x_t[:, v], alpha_bar) for v, P in enumerate(cameras.image_axes)]
         return self.fault * np.stack(views, axis=1)
 
-    def view_covariance_product(self, x_t, alpha_bar, cameras, vectors):
-        views = []
-        for v, P in enumerate(cameras.image_axes):
-            S = P @ self.covariance @ P.T
-            views.append(vectors[:, v] @ (S - math.sqrt(alpha_bar) * S @ gain(S, alpha_bar)))
-        return np.stack(views, axis=1)
+    def view_covariance(self, x_t, alpha_bar, cameras):
+        views = [P @ self.covariance @ P.T for P in cameras.image_axes]
+        matrices = [S - math.sqrt(alpha_bar) * S @ gain(S, alpha_bar) for S in views]
+        return lambda vectors: np.stack(
+            [vectors[:, v] @ matrix for v, matrix in enumerate(matrices)], axis=1
+        )
 
     def _denoise(self, P, x_t, alpha_bar):
         mean, S = self.mean @ P.T, P @ self.covariance @ P.T

@@ -59,8 +59,8 @@ class GaussianMotion:
     def denoise_motion(self, x_t, alpha_bar):
         return self._denoise(np.eye(3), x_t, alpha_bar)
 
-    def motion_covariance_product(self, x_t, alpha_bar, vectors):
-        return self._denoise(np.eye(3), vectors, alpha_bar, covariance=True)
+    def motion_covariance(self, x_t, alpha_bar):
+        return lambda vectors: self._denoise(np.eye(3), vectors, alpha_bar, covariance=True)
 
     def denoise(self, x_t, alpha_bar, cameras, **options):
         """Like a network, treat every camera as orthographic."""
@@ -68,8 +68,8 @@ class GaussianMotion:
         views = [self._denoise(P, x_t[:, v], alpha_bar, **options) for v, P in enumerate(axes)]
         return np.stack(views, axis=1)
 
-    def view_covariance_product(self, x_t, alpha_bar, cameras, vectors):
-        return self.denoise(vectors, alpha_bar, cameras, covariance=True)
+    def view_covariance(self, x_t, alpha_bar, cameras):
+        return lambda vectors: self.denoise(vectors, alpha_bar, cameras, covariance=True)
 
     def _denoise(self, axes, x, alpha_bar, covariance=False):
         """Return E[x₀ | x_t = x] along the axes, or Cov[x₀ | x_t] x."""

@@ -101,11 +101,11 @@ def test_results_do_not_depend_on_batch_threads_or_cameras(prior):
     x_t, vectors = noisy(prior, B=40, V=3), noisy(prior, B=40, V=3, seed=2)
     cameras = Cameras.ring(3, elevation=1.0, perspective=True)
     batch = prior.denoise(x_t, 0.4, cameras)
-    product = prior.view_covariance_product(x_t, 0.4, cameras, vectors)
+    product = prior.view_covariance(x_t, 0.4, cameras)(vectors)
     for rows in (slice(0, 1), slice(17, 18), slice(3, 31)):
         part = prior.denoise(x_t[rows], 0.4, Cameras.ring(3))
         np.testing.assert_array_equal(part, batch[rows])
-        part = prior.view_covariance_product(x_t[rows], 0.4, cameras, vectors[rows])
+        part = prior.view_covariance(x_t[rows], 0.4, cameras)(vectors[rows])
         np.testing.assert_array_equal(part, product[rows])
     swapped = prior.denoise(np.ascontiguousarray(x_t[:, [2, 0, 1]]), 0.4, cameras)
     np.testing.assert_array_equal(swapped, batch[:, [2, 0, 1]])
@@ -170,7 +170,7 @@ def test_covariance_product_of_a_linear_network():
     expected = ((deviation * v).reshape(3, 2, 96) @ matrix).reshape(v.shape) / spread
     expected *= (1 - alpha_bar) / math.sqrt(alpha_bar)
     with torch.no_grad():
-        product = prior.view_covariance_product(x_t, alpha_bar, cameras, v)
+        product = prior.view_covariance(x_t, alpha_bar, cameras)(v)
     np.testing.assert_allclose(product, expected, atol=1e-5)
 
 
@@ -241,7 +241,7 @@ def test_invalid_input_is_rejected(prior):
         with pytest.raises(ValueError, match=message):
             prior.denoise(values, 0.4, CAMERA)
     with pytest.raises(ValueError, match="vectors must have shape"):
-        prior.view_covariance_product(x_t, 0.4, CAMERA, x_t[:2])
+        prior.view_covariance(x_t, 0.4, CAMERA)(x_t[:2])
     with pytest.raises(ValueError, match="card must describe a trained network"):
         prior.save("no.safetensors")
     for name, value in (("steps", 1), ("dropout", 1.0), ("width", 9)):

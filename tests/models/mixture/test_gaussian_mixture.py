@@ -156,8 +156,8 @@ def test_denoisers_and_covariances_match_dense_algebra(prior, alpha_bar):
     X, V = rng.normal(size=(2, 4, L, J, 3))
     x, v = rng.normal(size=(2, 4, 3, L, J, 2))
     mean = prior.denoise(x, alpha_bar, cameras)
-    product = prior.view_covariance_product(x, alpha_bar, cameras, v)
-    product_3d = prior.motion_covariance_product(X, alpha_bar, V)
+    product = prior.view_covariance(x, alpha_bar, cameras)(v)
+    product_3d = prior.motion_covariance(X, alpha_bar)(V)
     views = [(x[:, i], v[:, i], mean[:, i], product[:, i]) for i in range(3)]
     results = [(X, V, prior.denoise_motion(X, alpha_bar), product_3d), *views]
     images = [None, *cameras.image_axes]

@@ -27,7 +27,7 @@ def test_denoiser_and_covariance_products(prior, dense, noisy, assert_close, alp
     x_t = noisy(alpha_bar)
     vectors = np.random.default_rng(3).normal(size=x_t.shape)
     means = prior.denoise_motion(x_t, alpha_bar)
-    products = prior.motion_covariance_product(x_t, alpha_bar, vectors)
+    products = prior.motion_covariance(x_t, alpha_bar)(vectors)
     for x, v, mean, product in zip(x_t, vectors, means, products, strict=True):
         expected, covariance = dense.denoised(x, alpha_bar).moments()
         assert_close(mean.reshape(-1), expected / prior.scale)
@@ -37,14 +37,14 @@ def test_denoiser_and_covariance_products(prior, dense, noisy, assert_close, alp
 def test_clean_motions_are_unchanged(prior):
     x = prior.sample(np.random.default_rng(1), 2) / prior.scale
     np.testing.assert_allclose(prior.denoise_motion(x, 1.0), x, atol=1e-12)
-    assert np.abs(prior.motion_covariance_product(x, 1.0, x)).max() < 1e-12
+    assert np.abs(prior.motion_covariance(x, 1.0)(x)).max() < 1e-12
 
 
 def test_rounding_does_not_depend_on_the_batch(prior, noisy):
     x_t = noisy(0.6, 21)
-    together = prior.denoise_motion(x_t, 0.6), prior.motion_covariance_product(x_t, 0.6, x_t[::-1])
+    together = prior.denoise_motion(x_t, 0.6), prior.motion_covariance(x_t, 0.6)(x_t[::-1])
     for i in (0, 15, 20):
         row, vector = x_t[i : i + 1], x_t[::-1][i : i + 1]
         np.testing.assert_array_equal(prior.denoise_motion(row, 0.6)[0], together[0][i])
-        alone = prior.motion_covariance_product(row, 0.6, vector)
+        alone = prior.motion_covariance(row, 0.6)(vector)
         np.testing.assert_array_equal(alone[0], together[1][i])

@@ -222,7 +222,7 @@ def test_invalid_arguments_are_rejected(prior, noisy):
         (r"alpha_bar must be in \(0, 1\], got 0", lambda: prior.denoise_motion(x_t, 0.0)),
         (r"alpha_bar must be in \(0, 1\], got 1.5", lambda: prior.denoise_motion(x_t, 1.5)),
         (r"got \(3, 2, 4, 3\)", lambda: prior.denoise_motion(x_t[:, :2], 0.5)),
-        (r"vectors must have shape", lambda: prior.motion_covariance_product(x_t, 0.5, x_t[:1])),
+        (r"vectors must have shape", lambda: prior.motion_covariance(x_t, 0.5)(x_t[:1])),
         ("got perspective", lambda: prior.denoise(x_t[:, None, ..., :2], 0.5, perspective)),
         (r"x_t must have shape \(B, 1", lambda: prior.denoise(x_t[..., :2], 0.5, Cameras.ring(1))),
         (r"got \(3, 2, 4, 3\)", lambda: prior.log_prior(x_t[:, :2])),

@@ -17,7 +17,7 @@ def test_denoiser_and_covariance_products(prior, dense, noisy, assert_close, alp
     x_t = noisy_views(noisy(alpha_bar))
     vectors = np.random.default_rng(3).normal(size=x_t.shape)
     means = prior.denoise(x_t, alpha_bar, VIEWS)
-    products = prior.view_covariance_product(x_t, alpha_bar, VIEWS, vectors)
+    products = prior.view_covariance(x_t, alpha_bar, VIEWS)(vectors)
     for view, axes in enumerate(VIEWS.image_axes):
         project = np.kron(np.eye(20), axes)
         for i in range(len(x_t)):
@@ -35,9 +35,9 @@ def test_clean_views_are_unchanged(prior):
 def test_rounding_does_not_depend_on_the_batch(prior, noisy):
     x_t = noisy_views(noisy(0.6, 21))
     means = prior.denoise(x_t, 0.6, VIEWS)
-    products = prior.view_covariance_product(x_t, 0.6, VIEWS, x_t[::-1])
+    products = prior.view_covariance(x_t, 0.6, VIEWS)(x_t[::-1])
     for i in (0, 15, 20):
         row, vector = x_t[i : i + 1], x_t[::-1][i : i + 1]
         np.testing.assert_array_equal(prior.denoise(row, 0.6, VIEWS)[0], means[i])
-        alone = prior.view_covariance_product(row, 0.6, VIEWS, vector)
+        alone = prior.view_covariance(row, 0.6, VIEWS)(vector)
         np.testing.assert_array_equal(alone[0], products[i])

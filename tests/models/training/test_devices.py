@@ -220,7 +220,7 @@ def test_networks_compute_what_they_compute_on_the_cpu():
         results.append(
             [
                 prior.denoise(x_t, 0.4, CAMERAS),
-                prior.view_covariance_product(x_t, 0.4, CAMERAS, vectors),
+                prior.view_covariance(x_t, 0.4, CAMERAS)(vectors),
                 evaluator.features(centred),
                 PoseLifter(moved, PERSON, device=device).lift(views),
             ]

@@ -54,8 +54,9 @@ def test_particles_correct_a_wrong_proposal(gaussian, keypoints):
     """Proposals without guidance have the wrong mean, which weights correct."""
 
     class Unguided(type(gaussian)):
-        def motion_covariance_product(self, x_t, alpha_bar, vectors):
-            return 0.3 * super().motion_covariance_product(x_t, alpha_bar, vectors)
+        def motion_covariance(self, x_t, alpha_bar):
+            covariance = super().motion_covariance(x_t, alpha_bar)
+            return lambda vectors: 0.3 * covariance(vectors)
 
     prior = Unguided(gaussian.mean, gaussian.covariance, gaussian.scale)
     mean, covariance = gaussian.posterior(keypoints)

@@ -99,7 +99,7 @@ def test_multi_view_covariance_is_the_symmetrised_jacobian(gaussian):
     repeated = np.repeat(x, 12, axis=0)
     up, down = (denoiser.denoise(x + sign * step * unit, alpha_bar) for sign in (1, -1))
     jacobian = ((up - down) / (2 * step)).reshape(12, 12).T
-    matrix = denoiser.covariance_product(repeated, alpha_bar, unit).reshape(12, 12).T
+    matrix = denoiser.covariance(repeated, alpha_bar)(unit).reshape(12, 12).T
     np.testing.assert_allclose(matrix, matrix.T, atol=1e-12)
     assert np.linalg.eigvalsh(matrix).min() > 0
     values, vectors = np.linalg.eigh(np.kron(np.eye(4), views.gram))
