@@ -6,7 +6,8 @@ frequency: each has a covariance matrix over the 2 J image coordinates, decompos
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,6 +18,21 @@ from probmotion.models.mixture.spectrum import to_frequencies
 __all__ = ["ViewSpectra"]
 
 _NEGLIGIBLE = 1e-16  # responsibilities below are set to 0
+_SMALLEST = 1e-200  # variance, so that squares of scores are finite
+
+
+class _Level(NamedTuple):
+    """Quantities that depend only on the variance v of the noise.
+
+    For components with the covariance S: ``precision`` (S + v)⁻¹ and ``own`` v S (S + v)⁻¹,
+    (C A, L, 2 J, 2 J), and ``offsets``, (C A,), log densities of y at their means, up to a
+    constant.
+    """
+
+    variance: float
+    precision: np.ndarray
+    own: np.ndarray
+    offsets: np.ndarray
 
 
 class ViewSpectra:
@@ -50,64 +66,75 @@ class ViewSpectra:
                 self._sizes[row] = np.maximum(size, 0.0)
                 self._means[row] = (mean @ projection.T).reshape(L, 2 * J)
                 row += 1
+        self._last: _Level | None = None
 
     def denoise(self, y: np.ndarray, variance: float) -> np.ndarray:
         """Return E[x | y]: ``(n, L, J, 2) → (n, L, J, 2)``."""
+        level = self._level(variance)
         out = np.empty_like(y)
-        for rows, block in blocks(y):
-            weights, means = self._condition(block, variance)
-            n = rows.stop - rows.start
-            mean = np.sum([weights[c, :, None, None] * part for c, part in means], axis=0)
-            out[rows] = mean[:n].reshape(n, *y.shape[1:])
+        for rows, block in self._blocks(y):
+            weights, scores = self._condition(block, level)
+            mean = block - variance * np.einsum("cn,clnp->lnp", weights, scores)
+            self._fill(out[rows], mean)
         return out
 
     def covariance(self, y: np.ndarray, variance: float) -> Callable[[np.ndarray], np.ndarray]:
         """Return u ↦ Cov[x | y] u for each row of y: arrays (n, L, J, 2)."""
-        gains = variance * self._sizes / (self._sizes + variance)
+        level = self._level(variance)
         states = []
-        for _, block in blocks(y):
-            weights, means = self._condition(block, variance)
-            mean = np.sum([weights[c, :, None, None] * part for c, part in means], axis=0)
-            states.append([(c, weights[c, :, None, None], part - mean) for c, part in means])
+        for _, block in self._blocks(y):
+            weights, scores = self._condition(block, level)
+            # Distances of the components' conditional means from their mean.
+            scores = scores - np.einsum("cn,clnp->lnp", weights, scores)
+            used = np.flatnonzero(weights.any(axis=1))
+            states.append((used, weights[used], variance * scores[used]))
 
         def product(vectors: np.ndarray) -> np.ndarray:
             out = np.empty_like(vectors)
-            for (rows, direction), state in zip(blocks(vectors), states, strict=True):
-                flat = direction.reshape(len(direction), *self._means.shape[1:])
-                total = np.zeros_like(flat)
-                for c, weight, away in state:
-                    along = away * (away * flat).sum(axis=(1, 2), keepdims=True)
-                    total += weight * (self._product(c, gains[c], flat) + along)
-                n = rows.stop - rows.start
-                out[rows] = total[:n].reshape(n, *vectors.shape[1:])
+            for (rows, block), (used, weights, away) in zip(
+                self._blocks(vectors), states, strict=True
+            ):
+                along = weights * np.einsum("clnp,lnp->cn", away, block)
+                within = np.matmul(block, level.own[used])
+                total = np.einsum("cn,clnp->lnp", weights, within)
+                self._fill(out[rows], total + np.einsum("cn,clnp->lnp", along, away))
             return out
 
         return product
 
-    def _condition(
-        self, block: np.ndarray, variance: float
-    ) -> tuple[np.ndarray, list[tuple[int, np.ndarray]]]:
-        """Return responsibilities (C A, n), and the conditional means of those that are not 0."""
-        flat = block.reshape(len(block), *self._means.shape[1:])
-        total = self._sizes + variance
-        # Where view and noise are both exact, the observation decides alone.
-        precision = 1 / np.maximum(total, np.finfo(float).tiny)
-        logits = np.empty((len(self._means), len(block)))
-        for c, (mean, axes) in enumerate(zip(self._means, self._axes, strict=True)):
-            scores = np.matmul((flat - mean).swapaxes(0, 1), axes)  # (L, n, 2 J)
-            logits[c] = -0.5 * np.einsum("lnp,lp->n", scores**2, precision[c])
-        logits += (self._log_weights + 0.5 * np.log(precision).sum(axis=(1, 2)))[:, None]
+    def _level(self, variance: float) -> _Level:
+        """Return the quantities of a noise level; the last one is kept."""
+        level = self._last
+        if level is None or level.variance != variance:
+            # Where view and noise are both exact, the observation decides alone.
+            precision = 1 / np.maximum(self._sizes + variance, _SMALLEST)
+            offsets = self._log_weights + 0.5 * np.log(precision).sum(axis=(1, 2))
+            transposed = self._axes.swapaxes(2, 3)
+            whole, own = (
+                (self._axes * values[:, :, None, :]) @ transposed
+                for values in (precision, variance * self._sizes * precision)
+            )
+            level = self._last = _Level(variance, whole, own, offsets)
+        return level
+
+    def _condition(self, block: np.ndarray, level: _Level) -> tuple[np.ndarray, np.ndarray]:
+        """Return responsibilities (C A, n), and (y − E[x | y, c]) / v, (C A, L, n, 2 J)."""
+        deviations = block - self._means[:, :, None]
+        scores = np.matmul(deviations, level.precision)
+        logits = -0.5 * np.einsum("clnp,clnp->cn", deviations, scores)
+        logits += level.offsets[:, None]
         weights = np.exp(logits - logits.max(axis=0))
         weights /= weights.sum(axis=0)
         weights[weights < _NEGLIGIBLE] = 0.0
-        gain = self._sizes * precision
-        means = []
-        for c in np.flatnonzero(weights.any(axis=1)).tolist():
-            deviation = self._product(c, gain[c], flat - self._means[c])
-            means.append((c, self._means[c] + deviation))
-        return weights, means
+        return weights, scores
 
-    def _product(self, c: int, gain: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-        """Return U diag(gain) Uᵀ v at each frequency: ``(n, L, 2 J) → (n, L, 2 J)``."""
-        scores = np.matmul(vectors.swapaxes(0, 1), self._axes[c]) * gain[:, None, :]
-        return np.matmul(scores, self._axes[c].swapaxes(1, 2)).swapaxes(0, 1)
+    def _blocks(self, rows: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
+        """Yield the slice and the rows of each block, (L, n, 2 J), padded with zeros."""
+        L, P = self._means.shape[1:]
+        for part, block in blocks(rows):
+            yield part, np.ascontiguousarray(block.reshape(-1, L, P).swapaxes(0, 1))
+
+    @staticmethod
+    def _fill(out: np.ndarray, block: np.ndarray) -> None:
+        """Write the rows of a block, (L, n, 2 J), to ``out``, (≤ n, L, J, 2)."""
+        out[...] = block.swapaxes(0, 1)[: len(out)].reshape(out.shape)
