@@ -168,6 +168,7 @@ class MotionDiffusion(TrackNetwork):
         is only approximately symmetric.
         """
         self._check(x_t)
+        x_t = x_t.copy()
         network = self._network_at(alpha_bar)
         factor = (1 - alpha_bar) / math.sqrt(alpha_bar)
 

@@ -282,6 +282,7 @@ class GaussianMixtureMotion:
         ]
 
         def product(vectors: np.ndarray) -> np.ndarray:
+            check_shape("vectors", vectors, x_t.shape)
             out = np.empty_like(vectors)
             for view, covariance in enumerate(covariances):
                 flat = np.ascontiguousarray(vectors[:, view]).reshape(rows)

@@ -147,10 +147,9 @@ class RotatedSpectra:
         for _, block in blocks(y):
             bases = self._bases(block, self._means, self._space())
             states.append((bases, self._responsibilities(bases, level)))
-        turned = self._space()
 
         def product(vectors: np.ndarray) -> np.ndarray:
-            out = np.empty_like(vectors)
+            out, turned = np.empty_like(vectors), self._space()
             for (rows, directions), (bases, weights) in zip(blocks(vectors), states, strict=True):
                 self._bases(directions, no_means, turned)
                 # Products of (y − E[X | y, k, s, a]) / v with the vectors, from 3×3 matrices.

@@ -355,6 +355,7 @@ class SpectralMixtureMotion:
         ]
 
         def product(vectors: np.ndarray) -> np.ndarray:
+            check_shape("vectors", vectors, x_t.shape)
             out = np.empty_like(vectors)
             for view, covariance in enumerate(covariances):
                 turned = to_frequencies(vectors[:, view], axis=1)

@@ -18,20 +18,18 @@ from probmotion.models.mixture.spectrum import to_frequencies
 __all__ = ["ViewSpectra"]
 
 _NEGLIGIBLE = 1e-16  # responsibilities below are set to 0
-_SMALLEST = 1e-200  # variance, so that squares of scores are finite
+_SMALLEST = 1e-200  # total variance, so that squared deviations times the precision are finite
 
 
 class _Level(NamedTuple):
     """Quantities that depend only on the variance v of the noise.
 
-    For components with the covariance S: ``precision`` (S + v)⁻¹ and ``own`` v S (S + v)⁻¹,
-    (C A, L, 2 J, 2 J), and ``offsets``, (C A,), log densities of y at their means, up to a
-    constant.
+    For components with the covariance S: ``precision`` (S + v)⁻¹, (C A, L, 2 J, 2 J), and
+    ``offsets``, (C A,), log densities of y at their means, up to a constant.
     """
 
     variance: float
     precision: np.ndarray
-    own: np.ndarray
     offsets: np.ndarray
 
 
@@ -84,7 +82,7 @@ class ViewSpectra:
         states = []
         for _, block in self._blocks(y):
             weights, scores = self._condition(block, level)
-            # Distances of the components' conditional means from their mean.
+            # Differences between the mean and the components' conditional means, divided by v.
             scores = scores - np.einsum("cn,clnp->lnp", weights, scores)
             used = np.flatnonzero(weights.any(axis=1))
             states.append((used, weights[used], variance * scores[used]))
@@ -95,9 +93,10 @@ class ViewSpectra:
                 self._blocks(vectors), states, strict=True
             ):
                 along = weights * np.einsum("clnp,lnp->cn", away, block)
-                within = np.matmul(block, level.own[used])
-                total = np.einsum("cn,clnp->lnp", weights, within)
-                self._fill(out[rows], total + np.einsum("cn,clnp->lnp", along, away))
+                # A component's own covariance is v − v² (S + v)⁻¹.
+                shrunk = np.matmul(block, level.precision[used])
+                own = variance * (block - variance * np.einsum("cn,clnp->lnp", weights, shrunk))
+                self._fill(out[rows], own + np.einsum("cn,clnp->lnp", along, away))
             return out
 
         return product
@@ -109,12 +108,8 @@ class ViewSpectra:
             # Where view and noise are both exact, the observation decides alone.
             precision = 1 / np.maximum(self._sizes + variance, _SMALLEST)
             offsets = self._log_weights + 0.5 * np.log(precision).sum(axis=(1, 2))
-            transposed = self._axes.swapaxes(2, 3)
-            whole, own = (
-                (self._axes * values[:, :, None, :]) @ transposed
-                for values in (precision, variance * self._sizes * precision)
-            )
-            level = self._last = _Level(variance, whole, own, offsets)
+            matrices = (self._axes * precision[:, :, None, :]) @ self._axes.swapaxes(2, 3)
+            level = self._last = _Level(variance, matrices, offsets)
         return level
 
     def _condition(self, block: np.ndarray, level: _Level) -> tuple[np.ndarray, np.ndarray]:

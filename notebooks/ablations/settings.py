@@ -1,7 +1,7 @@
 """Effect of the settings of each sampler.
 
     python notebooks/ablations/settings.py --out settings
-    python notebooks/ablations/settings.py --out quick --draws 12 --seeds 1     (two minutes)
+    python notebooks/ablations/settings.py --out quick --draws 12 --seeds 1
 
 ``--studies`` selects studies. Each is a comparison, stored with its table and report in a folder of
 ``--out``; run the same command again to resume an interrupted study.
@@ -92,7 +92,7 @@ class MirroredSampler(ExactSampler):
 
 @dataclass(frozen=True)
 class ExactlyGuided(Ancestral3D):
-    """Diffusion sampling with the exact denoiser of the posterior: errors are the integrator's."""
+    """Diffusion sampling with the exact denoiser of the posterior, without error of guidance."""
 
     name: ClassVar[str] = "exactly-guided"
 
@@ -126,16 +126,23 @@ def conditional_methods(budget: int) -> dict[str, Sampler]:
 STUDIES = {
     "integrators": Study(
         "integrators and noise levels at 50 evaluations of a 3D denoiser",
-        ("gait", "cmu", "quadruped", "cmu-motion", *CONDITIONED),
+        ("gait", "cmu", "quadruped", "cmu-motion"),
         {
             "ddpm, cosine": Ancestral3D(levels=Cosine(), integrator=DDPM()),
             "second order, cosine": Ancestral3D(levels=Cosine()),
             "second order, karras": Ancestral3D(levels=Karras()),
             "second order, log-snr": Ancestral3D(),
-            "second order, log-snr, guided in 6 steps": Ancestral3D(guidance=MomentMatched()),
-            "second order, log-snr, guided exactly": ExactlyGuided(),
             "heun, log-snr": Ancestral3D(steps=25, integrator=Heun()),
             "ddpm, log-snr": Ancestral3D(integrator=DDPM()),
+        },
+    ),
+    "guidance": Study(
+        "guidance of ancestral3d at 50 evaluations of a 3D denoiser",
+        CONDITIONED,
+        {
+            "moment matching": Ancestral3D(),
+            "moment matching, 6 steps": Ancestral3D(guidance=MomentMatched()),
+            "exact": ExactlyGuided(),
         },
     ),
     "elevations": Study(

@@ -7,7 +7,7 @@ of E[X₀ | X_t] to an estimate of E[X₀ | X_t, y].
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -22,6 +22,8 @@ __all__ = [
     "DPS", "AnyGuidance", "Guide", "LinearObservations", "LinearisedObservations", "MomentMatched",
     "Replacement", "WeightedTriangulation", "can_guide", "guide_towards",
 ]  # fmt: skip
+
+_ROWS = 64  # covariances of more rows would take hundreds of megabytes
 
 Guide = Callable[[np.ndarray, float, np.ndarray, PosteriorStep], np.ndarray]
 """(x_t, ᾱ, estimate, posterior step) → the estimate given the observations, (B, L, J, 3)."""
@@ -80,6 +82,10 @@ class LinearObservations:
         """Return ``self``, as the observations are linear."""
         return self
 
+    def rows(self, rows: slice) -> LinearObservations:
+        """Return ``self``, as the observations are those of all motions."""
+        return self
+
     def observe(self, motions: np.ndarray) -> np.ndarray:
         """Return A X: ``(B, L, J, 3) → (B, V, L, J, M)``."""
         return motions[:, None] @ self.axes.swapaxes(1, 2)[:, None]
@@ -104,6 +110,11 @@ class LinearisedObservations:
     axes: np.ndarray
     target: np.ndarray
     precision: np.ndarray
+
+    def rows(self, rows: slice) -> LinearisedObservations:
+        """Return the observations of some of the motions."""
+        axes = self.axes if self.axes.ndim == 2 else self.axes[rows]
+        return replace(self, axes=axes, target=self.target[rows])
 
     def observe(self, motions: np.ndarray) -> np.ndarray:
         """Return A X: ``(B, L, J, 3) → (B, L, J, K, 1)``."""
@@ -155,6 +166,21 @@ class MomentMatched:
         clean: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the conditional mean and (y − A D)ᵀ (A C Aᵀ + W⁻¹)⁻¹ (y − A D), (B,)."""
+        parts = [
+            self._condition(observations.rows(rows), denoiser, x_t[rows], alpha_bar, clean[rows])
+            for rows in _parts(len(x_t))
+        ]
+        means, squares = zip(*parts, strict=True)
+        return np.concatenate(means), np.concatenate(squares)
+
+    def _condition(
+        self,
+        observations: LinearObservations | LinearisedObservations,
+        denoiser: StateDenoiser,
+        x_t: np.ndarray,
+        alpha_bar: float,
+        clean: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:
         root = np.sqrt(observations.precision)[..., None]
         covariance = denoiser.covariance(x_t, alpha_bar)
 
@@ -208,7 +234,13 @@ class DPS:
             length = np.sqrt((confidence * residual**2).sum(axis=(1, 2, 3, 4), keepdims=True))
             adjoint = observations.adjoint(confidence * residual / np.maximum(length, 1e-300))
             # ∇‖y − A D‖ = −Jᵀ Aᵀ (y − A D)/‖y − A D‖ with J = √ᾱ/(1−ᾱ) M^(-½) C M^(½).
-            product = denoiser.covariance(x_t, alpha_bar)(adjoint @ inverse_half)
+            vectors = adjoint @ inverse_half
+            product = np.concatenate(
+                [
+                    denoiser.covariance(x_t[rows], alpha_bar)(vectors[rows])
+                    for rows in _parts(len(x_t))
+                ]
+            )
             gradient = -(np.sqrt(alpha_bar) / (1 - alpha_bar)) * (product @ half)
             # The estimate has weight step.clean in x_{t−1}, which must change by −ζ ∇.
             return clean - (self.step_size / step.clean) * gradient
@@ -293,6 +325,11 @@ def guide_towards(
             word=protocol.__name__,
         )
     return guidance.prepare(observations, denoiser)
+
+
+def _parts(n: int) -> list[slice]:
+    """Return the slices of rows whose covariances are in memory at a time."""
+    return [slice(start, start + _ROWS) for start in range(0, n, _ROWS)]
 
 
 def conjugate_gradients(

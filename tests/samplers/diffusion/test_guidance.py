@@ -7,10 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probmotion import Cameras, Joints3D, Keypoints2D, Motion, MotionPosterior, UnsupportedPosterior
+from probmotion import (
+    Cameras,
+    Joints3D,
+    Keypoints2D,
+    Motion,
+    MotionPosterior,
+    NoiseSchedule,
+    UnsupportedPosterior,
+)
 from probmotion.samplers import Ancestral3D, MultiViewAncestral, MultiViewPredictorCorrector
 from probmotion.samplers.diffusion.guidance import (
     DPS,
+    LinearisedObservations,
     LinearObservations,
     MomentMatched,
     Replacement,
@@ -64,6 +73,30 @@ def test_moment_matching_is_exact_for_a_gaussian(gaussian, observations, alpha_b
     unguided = denoiser.denoise(x_t, alpha_bar)
     assert abs(unguided - exact).max() > 0.01
     assert denoiser.counts == {"denoiser": 20, "covariance": 5 * (1 + 4 + 16)}
+
+
+def test_guidance_does_not_depend_on_the_rows_at_a_time(gaussian, keypoints, monkeypatch):
+    posterior, denoiser = MotionPosterior(gaussian, keypoints), MotionDenoiser(gaussian)
+    rng = np.random.default_rng(0)
+    x_t = rng.normal(size=(5, 2, 2, 3))
+    axes, target = rng.normal(size=(5, 2, 2, 4, 3)), rng.normal(size=(5, 2, 2, 4, 1))
+    linearised = LinearisedObservations(axes, target, np.ones((2, 2, 4)))
+    results = []
+    for rows in (64, 2):
+        monkeypatch.setattr("probmotion.samplers.diffusion.guidance._ROWS", rows)
+        guides = [
+            guide_towards(Ancestral3D(), posterior, method, denoiser)
+            for method in (MomentMatched(), DPS())
+        ]
+        step = NoiseSchedule.cosine(10).posterior(5)
+        results.append(
+            [
+                *(guide(x_t, 0.4, x_t / 2, step) for guide in guides),
+                *MomentMatched().condition(linearised, denoiser, x_t, 0.4, x_t / 2),
+            ]
+        )
+    for whole, parts in zip(*results, strict=True):
+        np.testing.assert_allclose(parts, whole, rtol=1e-12)
 
 
 def test_exactly_guided_draws_are_those_of_the_posterior(gaussian, keypoints):
