@@ -29,7 +29,7 @@ WHEN = {
     "tempered": "log density with modes far apart, and a prior that can be sampled",
     "smc": "the same; its evidence is estimated too",
     "ancestral3d": "3D denoiser",
-    "split-gibbs": "observations and an exact 2D or 3D denoiser",
+    "split-gibbs": "observations and an exact 3D denoiser; on gaits, 2D too",
     "mvpc": "2D denoiser without observations",
     "mas": "comparison with the published method; `mvpc` costs the same",
     "dvae": "priors with an inference network; otherwise it trains one first",
