@@ -167,22 +167,27 @@ class MomentMatched:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the conditional mean and (y − A D)ᵀ (A C Aᵀ + W⁻¹)⁻¹ (y − A D), (B,)."""
         parts = [
-            self._condition(observations.rows(rows), denoiser, x_t[rows], alpha_bar, clean[rows])
+            self._solve(
+                denoiser.covariance(x_t[rows], alpha_bar), observations.rows(rows), clean[rows]
+            )
             for rows in _parts(len(x_t))
         ]
-        means, squares = zip(*parts, strict=True)
-        return np.concatenate(means), np.concatenate(squares)
+        change, square = (np.concatenate(part) for part in zip(*parts, strict=True))
+        if not np.isfinite(change).all():
+            raise ValueError(
+                f"guidance with steps={self.steps} diverged at alpha_bar={alpha_bar:.3g}, "
+                "because the denoiser's Jacobian is not symmetric; use fewer steps"
+            )
+        return clean + change, square
 
-    def _condition(
+    def _solve(
         self,
+        covariance: Callable[[np.ndarray], np.ndarray],
         observations: LinearObservations | LinearisedObservations,
-        denoiser: StateDenoiser,
-        x_t: np.ndarray,
-        alpha_bar: float,
         clean: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the change of the mean, and the squared residual, (B,)."""
         root = np.sqrt(observations.precision)[..., None]
-        covariance = denoiser.covariance(x_t, alpha_bar)
 
         def spread(entries: np.ndarray) -> np.ndarray:
             """Return C Aᵀ W^½ u."""
@@ -195,12 +200,7 @@ class MomentMatched:
         residual = root * (observations.target - observations.observe(clean))
         # Weight both sides by W^½, because W⁻¹ does not exist for missing entries.
         change = conjugate_gradients(spread, whiten, residual, self.steps)
-        if not np.isfinite(change).all():
-            raise ValueError(
-                f"guidance with steps={self.steps} diverged at alpha_bar={alpha_bar:.3g}, "
-                "because the denoiser's Jacobian is not symmetric; use fewer steps"
-            )
-        return clean + change, _products(residual, residual - whiten(change))
+        return change, _products(residual, residual - whiten(change))
 
 
 @dataclass(frozen=True)

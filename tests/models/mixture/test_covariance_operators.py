@@ -15,7 +15,7 @@ def test_operators_keep_their_state(name, views):
     posterior = load_problem(name).posterior
     prior = posterior.prior
     size = (posterior.frames, posterior.skeleton.n_joints)
-    shape = (3, 2, *size, 2) if views else (3, *size, 3)
+    shape = (70, 2, *size, 2) if views else (70, *size, 3)  # several blocks
     x_t, one, other = np.random.default_rng(0).normal(size=(3, *shape))
 
     def covariance(points, alpha_bar):
