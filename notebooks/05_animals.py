@@ -147,7 +147,7 @@ for mode in ("regression", "optimization"):
         accuracy.aligned_by_root(truth.positions, 0),
     )
     rows[mode] = {"error of the mean, mm": 1000 * errors.mean()}
-print(pd.DataFrame(rows).T.round(0).to_string())
+print(pd.DataFrame(rows).T.round(1).to_string())
 
 # %%
 shown = {"draws": drawn[:1], "seen by one camera": draws[:1], "the truth": truth.positions[None]}

@@ -169,7 +169,7 @@ def test_animals(tmp_path, monkeypatch):
     assert number(r"mean joint error: (\d+) mm") < 80
     # The maximum acceleration at segment boundaries does not exceed that within segments.
     assert number(r"maximum acceleration ([\d.]+) times that within") <= 1
-    rows = {mode: number(rf"{mode} +(\d+)") for mode in ("regression", "optimization")}
+    rows = {mode: number(rf"{mode} +([\d.]+)") for mode in ("regression", "optimization")}
     assert rows["optimization"] < rows["regression"]
     assert 0.2 < number(r"relative to the animals: ([\d.]+)") < 1
     for name, labels in {
