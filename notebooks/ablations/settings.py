@@ -202,7 +202,11 @@ STUDIES = {
     "split-gibbs": Study(
         "split Gibbs with denoisers of 3D motion and of 2D views",
         CONDITIONED,
-        {f"split-gibbs, {kind}": SplitGibbs(denoiser=kind) for kind in ("3d", "2d")},
+        {
+            "split-gibbs, 3d": SplitGibbs(denoiser="3d"),
+            "split-gibbs, 2d": SplitGibbs(denoiser="2d"),
+            "split-gibbs, 3d, 1200 steps": SplitGibbs(denoiser="3d", steps=1200),
+        },
     ),
     "views": Study(
         "number of views, and noise shared between views",
