@@ -205,7 +205,7 @@ STUDIES = {
         {
             "split-gibbs, 3d": SplitGibbs(denoiser="3d"),
             "split-gibbs, 2d": SplitGibbs(denoiser="2d"),
-            "split-gibbs, 3d, 1200 steps": SplitGibbs(denoiser="3d", steps=1200),
+            "split-gibbs, 1200 steps": SplitGibbs(denoiser="3d", steps=1200),
         },
     ),
     "views": Study(
