@@ -205,7 +205,6 @@ STUDIES = {
         {
             "split-gibbs, 3d": SplitGibbs(denoiser="3d"),
             "split-gibbs, 2d": SplitGibbs(denoiser="2d"),
-            "split-gibbs, 1200 steps": SplitGibbs(denoiser="3d", steps=1200),
         },
     ),
     "views": Study(
