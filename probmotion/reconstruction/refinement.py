@@ -29,9 +29,10 @@ _FIXED = 100.0  # precision of what has no meaning
 _SAME = 0.1  # squared distance of two modes per coordinate below which they are the same
 _ROWS = 48  # number of θ rendered at once
 _BELIEVED = 0.005
-"""Share of the information of the images in the spread of draws: their errors are larger than the
-curvature at a mode says, because the likelihood is rugged. Chosen on validation images, such that
-intervals of 90 % hold."""
+"""Share of the information of an image in the spread of draws: their errors are larger than the
+curvature at a mode says, because the likelihood is rugged. For T images, the share is divided by
+√T, since the images of a clip have errors in common. Chosen on validation images and clips, such
+that intervals of 90 % hold."""
 
 
 class Mode(NamedTuple):
@@ -83,6 +84,7 @@ def refine(
             reached = _diverse(prior, reached)[:keep]
         points = [point for point, _ in reached]
     start = prior.layout.view.start
+    believed = _BELIEVED / math.sqrt(observed.images)
     for point, value in reached:
         # The length of the two coordinates of the direction does not matter: draws keep it, or
         # they would cross the origin and face the other way.
@@ -94,7 +96,7 @@ def refine(
         _, information = likelihood.curvature(
             images[0], _derivatives(prior, point, images[0], likelihood)
         )
-        precision = _BELIEVED * information.double().numpy() + np.eye(len(point))
+        precision = believed * information.double().numpy() + np.eye(len(point))
         radial = np.zeros(len(point))
         radial[start : start + 2] = turned[start : start + 2] / math.sqrt(2)
         precision += _FIXED * np.outer(radial, radial)
