@@ -31,9 +31,10 @@ ROWS: tuple[tuple[str, str, float, Mapping[str, Sampler]], ...] = (
 
 
 def mixing_figures() -> Iterator[tuple[str, float]]:
-    """Yield the smallest ``swd_ratio`` of the samplers, each a mean over seeds.
+    """Yield the smallest ``swd_ratio`` of the samplers, a mean over seeds, for every row.
 
-    It is infinite if no sampler finishes all seeds within the budget.
+    It is infinite if no sampler finishes all seeds within the budget. The last figure is the number
+    of problems without a right sampler.
     """
     options = {"draws": DRAWS, "chains": CHAINS, "seeds": SEEDS, "workers": 2, "progress": False}
     right = set()

@@ -196,7 +196,7 @@ class SplitGibbs(ConditionalSampler):
         shape = x.shape[1:]
         last = _ANNEALED_TO * step.noise
         levels = -(-self.steps // _STEPS_PER_LEVEL)
-        # Even in 1/ρ, as more steps at small ρ are what the Langevin dynamics need.
+        # Even in 1/ρ: the Langevin dynamics need most of their steps at small ρ.
         rhos = 1 / np.linspace(1 / max(_ANNEALED_FROM, last), 1 / last, levels)
         z = step.coupling(x, rhos[0], streams).draw(x, streams.normal(*shape))
         velocity = streams.normal(*shape)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -14,7 +16,8 @@ from probmotion.models.images.encoder import Estimates
 from probmotion.models.images.made_images import make_images
 from probmotion.models.images.observation import ImageObservation
 from probmotion.models.images.surface_prior import SurfacePrior
-from probmotion.reconstruction import Reconstruction, reconstruct
+from probmotion.models.latent.turn_code import TurnCode
+from probmotion.reconstruction import Reconstruction, reconstruct, refinement
 from probmotion.reconstruction.inference import _uncovered, encoded
 from probmotion.reconstruction.refinement import Mode, promising, refine
 
@@ -56,6 +59,26 @@ def test_refinement_finds_the_pose_again(animal) -> None:
     radial[place] = mode.theta[place] / np.linalg.norm(mode.theta[place])
     assert np.linalg.norm(mode.theta[place]) == pytest.approx(np.sqrt(2), rel=1e-5)
     assert radial @ np.linalg.solve(mode.precision, radial) < 0.02
+
+
+def test_two_equal_images_count_less_than_two_independent_ones(animal, monkeypatch) -> None:
+    """A body that stands still: the information of T images is that of one, times √T."""
+    category, _, images = animal
+    code = category.code
+    still = TurnCode(code.mean[[0, 0]], code.basis[:, [0, 0]], code.fps)
+    category = replace(category, code=still)
+    monkeypatch.setattr(refinement, "_STAGES", ((32, 1.0, 0),))
+    precisions = []
+    for count in (1, 2):
+        prior = SurfacePrior(category, np.repeat(TANGENT, count))
+        theta = np.zeros((1, prior.dim))
+        theta[:, : images.theta.shape[1]] = images.theta[0]
+        one = observed(images, 0)
+        repeated = (np.repeat(part, count, axis=0) for part in (one.mask, one.rgb))
+        cameras = prior.tangent, np.tile(np.eye(3), (count, 1, 1))
+        (mode,) = refine(prior, ImageObservation(*repeated, None, *cameras), theta)
+        precisions.append(np.diag(mode.precision)[prior.layout.lengths] - 1)
+    np.testing.assert_allclose(precisions[1], np.sqrt(2) * precisions[0], rtol=1e-3)
 
 
 def test_the_most_probable_candidates_come_first(animal) -> None:
