@@ -50,6 +50,11 @@ def test_draws_are_exact_with_several_cameras(gaussian, keypoints, assert_covari
     assert_exact(SplitGibbs(steps=60, sweeps=6), gaussian, seen, assert_covariance)
 
 
+def exact_draws(mean, covariance, rng):
+    x = rng.normal(size=(SWEPT, mean.size)) @ np.linalg.cholesky(covariance).T
+    return mean + x.reshape(SWEPT, *mean.shape)
+
+
 class SharedGenerator(NormalStreams):
     """Streams of a batch from its first generator, which takes less time."""
 
@@ -69,8 +74,7 @@ def test_sweeps_leave_the_posterior_invariant(
         )
     mean, covariance = gaussian.posterior(keypoints)
     rng, posterior = np.random.default_rng(3), MotionPosterior(gaussian, keypoints)
-    x = rng.normal(size=(SWEPT, 12)) @ np.linalg.cholesky(covariance).T
-    x = mean + x.reshape(SWEPT, *mean.shape)
+    x = exact_draws(mean, covariance, rng)
     sampler = SplitGibbs(sweeps=30, inner_steps=12, share=share)
     pools = sampler._pools(posterior)
     step, _ = sampler._step(posterior, pools[0])
@@ -88,6 +92,20 @@ def test_sweeps_leave_the_posterior_invariant(
         assert (abs(x.mean(axis=0) - mean).ravel() < 5 * np.sqrt(np.diag(covariance) / SWEPT)).all()
     else:
         assert deviations > 4
+
+
+def test_langevin_dynamics_end_in_the_posterior(gaussian, keypoints, assert_covariance):
+    """Of precise keypoints: ρ falls from above their noise to below it, where z is exact."""
+    precise = replace(keypoints, noise=0.05 * keypoints.noise)
+    mean, covariance = gaussian.posterior(precise)
+    rng, posterior = np.random.default_rng(4), MotionPosterior(gaussian, precise)
+    x = exact_draws(mean, covariance, rng)
+    sampler = SplitGibbs()
+    pools = sampler._pools(posterior)
+    step, _ = sampler._step(posterior, pools[0])
+    streams = SharedGenerator([rng] * SWEPT)
+    x = gaussian.scale * sampler._anneal(pools, step, x / gaussian.scale, streams, lambda: None)
+    assert_covariance(x - mean, covariance)
 
 
 def test_reverse_diffusion_draws_from_the_conditional(gaussian, assert_covariance):
