@@ -23,6 +23,7 @@ import argparse
 import itertools
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -66,6 +67,7 @@ from probmotion.problems.denoising import limb_occlusions
 from probmotion.problems.joint_correction import correct_joints
 from probmotion.samplers import Ancestral3D, MultiViewPredictorCorrector
 from probmotion.samplers.conditional import SplitGibbs
+from probmotion.threads import one_thread
 
 COMPLETIONS = 60  # held-out annotations whose joints are completed
 FOCAL = 1000.0  # pixels, of the perspective cameras
@@ -504,8 +506,10 @@ def main() -> None:
             denoising_figures(Path(options.data)) if part == "denoising" else PARTS[part](pairs)
             for part in options.parts
         )
-    for name, value in figures:
-        print(f"{name}: {value:.4g}", flush=True)
+    # Rounding can lead to other modes of images.
+    with one_thread() if options.command == "images" else nullcontext():
+        for name, value in figures:
+            print(f"{name}: {value:.4g}", flush=True)
 
 
 if __name__ == "__main__":

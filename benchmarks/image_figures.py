@@ -41,11 +41,10 @@ from probmotion.models.images.observation import ImageObservation
 from probmotion.models.images.surface_prior import SurfacePrior
 from probmotion.models.latent.turn_code import TurnCode
 from probmotion.reconstruction import Reconstruction
-from probmotion.reconstruction.refinement import Mode, refine
+from probmotion.reconstruction.refinement import Mode
 
 DRAWS = 200
 ABLATED = 40  # images of each ablation
-STARTS, KEPT = 6, 3  # as in posterior_modes
 ABLATIONS = (
     "_without_colours",
     "_without_shapes",
@@ -69,15 +68,16 @@ def found(
     if suffix == "_without_shapes":
         category = replace(category, shapes=1e-6 * category.shapes)
     prior = SurfacePrior(category, observation.tangent)
+    if suffix not in ("_one_hypothesis", "_without_motion_prior"):
+        return prior, inference.posterior_modes(bodies.network, prior, observation)
     rng = seeds.generator(0, "starts")
+    likely, drawn = inference.encoded(bodies.network, prior, observation, rng, inference.DRAWN)
     if suffix == "_one_hypothesis":
-        starts = inference.encoded(bodies.network, prior, observation, rng, 0)
-        return prior, refine(prior, observation, starts[:1])
-    if suffix == "_without_motion_prior":
-        starts = inference.encoded(bodies.network, prior, observation, rng, STARTS)
-        prior, starts = independent(prior, starts)
-        return prior, refine(prior, observation, starts, keep=KEPT)
-    return prior, inference.posterior_modes(bodies.network, prior, observation)
+        likely = likely[:1]
+    else:
+        _, drawn = independent(prior, drawn)
+        prior, likely = independent(prior, likely)
+    return prior, inference.modes_of(prior, observation, likely, drawn)
 
 
 def independent(prior: SurfacePrior, theta: np.ndarray) -> tuple[SurfacePrior, np.ndarray]:
@@ -267,7 +267,7 @@ def of_encoder(bodies: Bodies, n: int) -> Figures:
         observation = bodies.image(number).observation
         prior = SurfacePrior(bodies.category, observation.tangent)
         rng = np.random.default_rng(0)
-        theta = inference.encoded(bodies.network, prior, observation, rng, 0)[0]
+        theta = inference.encoded(bodies.network, prior, observation, rng, 0)[0][0]
         rows.append({"mask_iou": overlaps(prior, theta, observation)})
     yield from means(rows, "_encoder")
 

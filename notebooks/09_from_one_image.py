@@ -193,7 +193,7 @@ pd.DataFrame({name: compared(each, other_truth) for name, each in results.items(
 # %% [markdown]
 # ## 5. Another sampler
 #
-# The draws above are from Gaussians about modes that are wider than the posterior: they count .5 % of the image's
+# The draws above are from Gaussians about modes that are wider than the posterior: they count 2 % of the image's
 # information. An image is an observation like any other, and `pm.posterior(prior, observation)` is the posterior for
 # every sampler of densities. Metropolis-Hastings starts at the draws and approximates nothing, but in a minute it does not
 # converge: the density has many narrow modes, and chains keep much of the spread of their starts. They show that the draws

@@ -135,21 +135,23 @@ def test_keypoints_are_transferred_by_what_is_seen_of_the_surface(script, catego
 def test_every_ablation_changes_one_thing(script, monkeypatch):
     """What is refined without colours, shapes, hypotheses or the motion prior, or with features."""
     bodies = script.Bodies("quadruped", None, "validation", 1)
-    starts = 0.1 * np.ones((4, script.SurfacePrior(bodies.category, np.ones(1)).dim))
-    monkeypatch.setattr(script.inference, "encoded", lambda *args: starts)
+    prior = script.SurfacePrior(bodies.category, np.ones(1))
+    starts = np.stack([prior.facing(np.zeros(prior.dim), yaw) for yaw in (1.5, 3.0)])
+    hypotheses = starts, np.tile(starts, (3, 1))
+    monkeypatch.setattr(script.inference, "encoded", lambda *args: hypotheses)
+    monkeypatch.setattr(script.inference, "modes_of", lambda *args: args)
     monkeypatch.setattr(
-        script.inference, "posterior_modes", lambda _, prior, seen: ((prior, seen, starts))
-    )
-    monkeypatch.setattr(
-        script, "refine", lambda prior, seen, starts, keep=None: (prior, seen, starts)
+        script.inference, "posterior_modes", lambda _, prior, seen: (prior, seen, *hypotheses)
     )
 
     def what(suffix):
-        prior, seen, starts = script.found(bodies, bodies.image(0).observation, suffix)[1]
+        prior, seen, likely, drawn = script.found(bodies, bodies.image(0).observation, suffix)[1]
+        assert drawn.shape == (6, prior.dim)
+        assert likely.shape == (1 if suffix == "_one_hypothesis" else 2, prior.dim)
         return {
             "_without_colours": seen.rgb is None,
             "_without_shapes": bool(np.abs(prior.category.shapes).max() < 1e-6),
-            "_one_hypothesis": len(starts) == 1,
+            "_one_hypothesis": len(likely) == 1,
             "_with_features": seen.features is not None,
             "_without_motion_prior": prior.category.code.frames == 1,
         }

@@ -13,17 +13,29 @@ from probmotion.models.images.encoder import EncoderNetwork, encoder_input, para
 from probmotion.models.images.encoder_training import TANGENTS, encoder_of
 from probmotion.models.images.observation import ImageObservation
 from probmotion.models.images.surface_prior import SurfacePrior
-from probmotion.reconstruction.refinement import Mode, promising, refine
+from probmotion.reconstruction.refinement import Mode, promising, quarters_of, refine
 from probmotion.reconstruction.result import Reconstruction
+from probmotion.threads import one_thread
 from probmotion.validation import check_count
 
-__all__ = ["checked", "encoded", "mixture_draws", "posterior_modes", "reconstruct"]
+__all__ = [
+    "DRAWN",
+    "checked",
+    "encoded",
+    "mixture_draws",
+    "modes_of",
+    "posterior_modes",
+    "reconstruct",
+]
 
-_STARTS, _KEPT = 6, 3  # draws from the encoder that are refined, and modes refined to the end
-# Clips: number of random motions, correlation of half of them with the encoder's code, and number
-# of modes that are refined to the end.
-_MOTIONS, _CERTAIN, _KEPT_CLIPS = 400, 0.7, 2
-_UNLIKELY = 0.02  # probability of a quarter turn below which its mean is not refined
+DRAWN = 1000
+"""Number of draws from the encoder of an image, of which the best are refined."""
+
+_STARTS, _KEPT = 12, 4  # draws that are refined, and modes that are refined to the end
+# Clips: number of random motions, correlation of half of them with the encoder's code, the best of
+# them that are refined, and modes that are refined to the end.
+_MOTIONS, _CERTAIN, _STARTS_CLIPS, _KEPT_CLIPS = 400, 0.7, 5, 2
+_UNLIKELY = 0.02  # probability of a quarter turn below which it is not refined
 _UNCOVERED, _UNUSUAL = 0.1, 2.0
 """Largest values of reconstructions that can be trusted.
 
@@ -33,6 +45,7 @@ polygons and letters, and on masks of the other category.
 """
 
 
+@one_thread()
 def reconstruct(
     observation: ImageObservation, category: Category, *, draws: int = 100, seed: int = 0
 ) -> Reconstruction:
@@ -42,7 +55,8 @@ def reconstruct(
     draws are those of a mixture of Gaussians at the modes, weighted by their evidence. The
     Gaussians are wider than the Laplace approximation, such that intervals hold in spite of the
     likelihood's many narrow modes. Images of a clip follow each other at the frame rate of the
-    category's motions.
+    category's motions. Linear algebra of the process uses one thread meanwhile: rounding could
+    lead to other modes.
 
     Parameters
     ----------
@@ -109,14 +123,17 @@ def _uncovered(result: Reconstruction) -> float:
     return float((1 - result.mask_iou) * square / max(outline, 1.0))
 
 
+@one_thread()
 def posterior_modes(
     network: EncoderNetwork, prior: SurfacePrior, observed: ImageObservation, seed: int = 0
 ) -> list[Mode]:
-    """Return modes of p(θ | images) that are reached from the encoder's hypotheses, best first."""
+    """Return modes of p(θ | images) that are reached from the encoder's hypotheses, best first.
+
+    They are found with one thread: the density is rugged, so that rounding can change them.
+    """
     rng = seeds.generator(seed, "starts")
     if observed.images == 1:
-        starts = encoded(network, prior, observed, rng, _STARTS)
-        return refine(prior, observed, starts, keep=_KEPT)
+        return modes_of(prior, observed, *encoded(network, prior, observed, rng, DRAWN))
     starts = _encoded_clip(network, prior, observed)
     # Single images leave left and right legs ambiguous, so that the encoder's means hardly move.
     tried = np.repeat(starts, -(-_MOTIONS // len(starts)), axis=0)
@@ -124,8 +141,24 @@ def posterior_modes(
     kept = np.where(np.arange(len(tried)) % 2, 0.0, _CERTAIN)[:, None]
     code = prior.layout.code
     tried[:, code] = kept * tried[:, code] + np.sqrt(1 - kept**2) * z
-    starts = np.concatenate([starts, promising(prior, observed, tried, _STARTS - 1)])
+    starts = np.concatenate([starts, promising(prior, observed, tried, _STARTS_CLIPS)])
     return refine(prior, observed, starts, keep=_KEPT_CLIPS)
+
+
+def modes_of(
+    prior: SurfacePrior, observed: ImageObservation, likely: np.ndarray, drawn: np.ndarray
+) -> list[Mode]:
+    """Return the modes reached from likely θ (m, dim) and from the best of draws (n, dim).
+
+    Refinement ends in the nearest of many modes: starts that are chosen by their density lie
+    closer to the best ones. Each quarter turn of the likely θ has as many.
+    """
+    quarters, chosen = quarters_of(prior, drawn), np.unique(quarters_of(prior, likely))
+    best = [
+        promising(prior, observed, drawn[quarters == quarter], _STARTS // len(chosen))
+        for quarter in chosen
+    ]
+    return refine(prior, observed, np.concatenate([likely, *best]), keep=_KEPT)
 
 
 def _encoded_clip(
@@ -150,10 +183,10 @@ def encoded(
     observed: ImageObservation,
     rng: np.random.Generator,
     n: int,
-) -> np.ndarray:
-    """Return the encoder's mean θ of each likely quarter turn, likeliest first, and ``n`` draws.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the encoder's mean θ of each likely quarter turn (m, dim), and n draws (n, dim).
 
-    The encoder sees the only image. The result is (m + n, dim).
+    The encoder sees the only image. The likeliest quarter turn is first.
     """
     with torch.no_grad():
         estimates = network(encoder_input(observed.mask, observed.rgb))
@@ -166,8 +199,8 @@ def encoded(
     values = np.concatenate([means[likely], means[drawn] + noise])
     quarters = np.concatenate([likely, drawn])
     view = prior.layout.view.start
-    theta = parameters_of(torch.as_tensor(values), torch.as_tensor(quarters), view)
-    return np.asarray(theta.numpy())
+    theta = parameters_of(torch.as_tensor(values), torch.as_tensor(quarters), view).numpy()
+    return theta[: len(likely)], theta[len(likely) :]
 
 
 def mixture_draws(modes: list[Mode], rng: np.random.Generator, n: int) -> np.ndarray:

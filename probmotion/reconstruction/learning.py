@@ -18,6 +18,7 @@ from probmotion.models.images.surface_prior import SurfacePrior
 from probmotion.posteriors.sampling import progress_bar
 from probmotion.reconstruction.inference import encoded
 from probmotion.reconstruction.refinement import refine
+from probmotion.threads import one_thread
 from probmotion.validation import check_count
 
 __all__ = ["CATEGORY", "check_rounds", "learn_category", "rounds_done"]
@@ -77,8 +78,10 @@ def learn_category(
             learnt = Category.load(folder / CATEGORY)
         for number in range(done + 1, rounds + 1):
             try:
-                theta = _poses(learnt, network, images, f"poses, round {number}", progress)
-                learnt = learn_surface(learnt, images, theta, progress=progress)
+                # Rounding can lead to other modes of a pose.
+                with one_thread():
+                    theta = _poses(learnt, network, images, f"poses, round {number}", progress)
+                    learnt = learn_surface(learnt, images, theta, progress=progress)
             except KeyboardInterrupt as error:
                 raise KeyboardInterrupt(
                     f"stopped in round {number} of {rounds}; finished rounds are saved in "
@@ -154,7 +157,7 @@ def _poses(
             if not category.features.shape[1]:
                 image = replace(image, features=None)
             prior = SurfacePrior(category, image.tangent)
-            starts = encoded(network, prior, image, np.random.default_rng(0), 0)
-            found.append(refine(prior, image, starts, keep=_KEPT)[0].theta)
+            likely, _ = encoded(network, prior, image, np.random.default_rng(0), 0)
+            found.append(refine(prior, image, likely, keep=_KEPT)[0].theta)
             bar.update(1)
     return np.stack(found)

@@ -17,22 +17,24 @@ from probmotion.models.images.image_likelihood import ImageLikelihood
 from probmotion.models.images.observation import ImageObservation
 from probmotion.models.images.surface_prior import SurfacePrior
 
-__all__ = ["Mode", "promising", "refine"]
+__all__ = ["Mode", "promising", "quarters_of", "refine"]
 
-# Size of the images, pixels, softness of the likelihood, and largest number of steps.
-_STAGES = ((32, 4.0, 8), (64, 2.0, 6), (64, 1.0, 12))
-_DIFFERENCE = 0.05  # of θ, whose prior has standard deviation 1
+# Size of the images, pixels, softness of the likelihood, and largest number of steps. The first,
+# softest likelihood chooses among candidates, and the points that go on.
+_STAGES = ((32, 8.0, 6), (32, 4.0, 6), (64, 2.0, 6), (64, 1.0, 12))
+_DIFFERENCE = 0.05  # of θ, whose prior has standard deviation 1, for a likelihood of softness 1
+_LARGEST = 0.15  # difference of θ for softer likelihoods: it sees silhouettes farther away
 _DAMPING = (0.03, 0.3, 3.0, 30.0)  # tried in every step, relative to the diagonal
 _LONGEST = 4.0  # longest step of θ
 _SMALLEST_GAIN = 0.1  # of log density; below, a stage ends
 _FIXED = 100.0  # precision of what has no meaning
 _SAME = 0.1  # squared distance of two modes per coordinate below which they are the same
 _ROWS = 48  # number of θ rendered at once
-_BELIEVED = 0.005
+_BELIEVED = 0.02
 """Share of the information of an image in the spread of draws: their errors are larger than the
-curvature at a mode says, because the likelihood is rugged. For T images, the share is divided by
-√T, since the images of a clip have errors in common. Chosen on validation images and clips, such
-that intervals of 90 % hold."""
+curvature at a mode says, because the likelihood is rugged. The share of T images is divided by T,
+since the images of a clip have errors in common. Chosen on validation images and clips, such that
+intervals of 90 % hold."""
 
 
 class Mode(NamedTuple):
@@ -69,7 +71,7 @@ def refine(
     """Return the modes that Gauss-Newton steps find from the starts (n, dim), best first.
 
     Likelihoods become sharper from stage to stage. With ``keep``, only so many points go on after
-    the first stage: the best of each quarter turn before the others.
+    the first stage: the best of each quarter turn, then the second best of each.
     """
     points = [torch.as_tensor(start, dtype=torch.float32) for start in starts]
     modes: list[Mode] = []
@@ -84,7 +86,7 @@ def refine(
             reached = _diverse(prior, reached)[:keep]
         points = [point for point, _ in reached]
     start = prior.layout.view.start
-    believed = _BELIEVED / math.sqrt(observed.images)
+    believed = _BELIEVED / observed.images
     for point, value in reached:
         # The length of the two coordinates of the direction does not matter: draws keep it, or
         # they would cross the origin and face the other way.
@@ -120,6 +122,12 @@ def promising(
     return np.asarray(candidates[best.numpy()])
 
 
+def quarters_of(prior: SurfacePrior, theta: np.ndarray) -> np.ndarray:
+    """Return the quarter turn of the direction in which each of n bodies (n, dim) faces."""
+    start = prior.layout.view.start
+    return quarter_of(np.arctan2(theta[:, start], theta[:, start + 1]))[0]
+
+
 def _distinct(modes: list[Mode]) -> list[Mode]:
     """Return the modes without those that another start has reached, too."""
     found: list[Mode] = []
@@ -134,16 +142,10 @@ def _distinct(modes: list[Mode]) -> list[Mode]:
 def _diverse(
     prior: SurfacePrior, reached: list[tuple[torch.Tensor, float]]
 ) -> list[tuple[torch.Tensor, float]]:
-    """Return sorted points with the best of each quarter turn first."""
-    start = prior.layout.view.start
-    first: list[tuple[torch.Tensor, float]] = []
-    others: list[tuple[torch.Tensor, float]] = []
-    seen = set()
-    for point, value in reached:
-        quarter, _ = quarter_of(np.arctan2(point[start].numpy(), point[start + 1].numpy()))
-        (others if int(quarter) in seen else first).append((point, value))
-        seen.add(int(quarter))
-    return first + others
+    """Return sorted points with the best of each quarter turn first, then the second of each."""
+    quarters = quarters_of(prior, np.stack([point.numpy() for point, _ in reached]))
+    ranks = [int((quarters[:k] == quarter).sum()) for k, quarter in enumerate(quarters)]
+    return [reached[k] for k in np.argsort(ranks, kind="stable")]
 
 
 def _ascend(
@@ -197,5 +199,6 @@ def _derivatives(
     prior: SurfacePrior, theta: torch.Tensor, images: torch.Tensor, likelihood: ImageLikelihood
 ) -> torch.Tensor:
     """Return the derivatives of the images in all coordinates, (dim, T, S, S, C)."""
-    moved = theta + _DIFFERENCE * torch.eye(len(theta))
-    return (_images(prior, moved, likelihood) - images) / _DIFFERENCE
+    difference = min(_DIFFERENCE * likelihood.softness, _LARGEST)
+    moved = theta + difference * torch.eye(len(theta))
+    return (_images(prior, moved, likelihood) - images) / difference

@@ -13,11 +13,13 @@ import torch
 
 from probmotion.models.images.category import Category
 from probmotion.models.images.encoder import Estimates
+from probmotion.models.images.encoder_training import encoder_of
+from probmotion.models.images.image_likelihood import ImageLikelihood
 from probmotion.models.images.made_images import make_images
 from probmotion.models.images.observation import ImageObservation
 from probmotion.models.images.surface_prior import SurfacePrior
 from probmotion.models.latent.turn_code import TurnCode
-from probmotion.reconstruction import Reconstruction, reconstruct, refinement
+from probmotion.reconstruction import Reconstruction, inference, reconstruct, refinement
 from probmotion.reconstruction.inference import _uncovered, encoded
 from probmotion.reconstruction.refinement import Mode, promising, refine
 
@@ -61,8 +63,8 @@ def test_refinement_finds_the_pose_again(animal) -> None:
     assert radial @ np.linalg.solve(mode.precision, radial) < 0.02
 
 
-def test_two_equal_images_count_less_than_two_independent_ones(animal, monkeypatch) -> None:
-    """A body that stands still: the information of T images is that of one, times √T."""
+def test_two_equal_images_tell_as_much_as_one(animal, monkeypatch) -> None:
+    """A body that stands still: the information of T images is that of one."""
     category, _, images = animal
     code = category.code
     still = TurnCode(code.mean[[0, 0]], code.basis[:, [0, 0]], code.fps)
@@ -78,7 +80,7 @@ def test_two_equal_images_count_less_than_two_independent_ones(animal, monkeypat
         cameras = prior.tangent, np.tile(np.eye(3), (count, 1, 1))
         (mode,) = refine(prior, ImageObservation(*repeated, None, *cameras), theta)
         precisions.append(np.diag(mode.precision)[prior.layout.lengths] - 1)
-    np.testing.assert_allclose(precisions[1], np.sqrt(2) * precisions[0], rtol=1e-3)
+    np.testing.assert_allclose(precisions[1], precisions[0], rtol=1e-3)
 
 
 def test_the_most_probable_candidates_come_first(animal) -> None:
@@ -96,13 +98,80 @@ def test_estimates_of_the_network_become_parameters(animal) -> None:
     means = torch.linspace(-0.3, 0.6, prior.dim - 1).tile(1, 4, 1)
     weights = torch.tensor([[0.004, 0.99, 0.003, 0.003]]).log()
     estimates = Estimates(weights, means, torch.full_like(means, -5.0))
-    found = encoded(lambda _: estimates, prior, observed(images, 0), np.random.default_rng(0), 0)
+    rng = np.random.default_rng(0)
+    found, drawn = encoded(lambda _: estimates, prior, observed(images, 0), rng, 300)
     values = means[0, quarter].numpy()
     assert found.shape == (1, prior.dim)
+    assert drawn.shape == (300, prior.dim)
+    same = np.abs(drawn - found).max(axis=1) < 0.1
+    assert 0.97 < same.mean() < 1
+    assert (drawn - found)[same][:, :start].std() == pytest.approx(np.exp(-5), rel=0.05)
     np.testing.assert_allclose(found[0, :start], values[1 : start + 1])
     np.testing.assert_allclose(found[0, start + 2 :], values[start + 1 :])
     yaw = np.arctan2(found[0, start], found[0, start + 1])
     assert yaw == pytest.approx(np.pi / 2 + values[0])
+
+
+@pytest.fixture
+def two_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+def test_the_best_draws_of_likely_quarters_are_refined(animal, monkeypatch) -> None:
+    _, prior, images = animal
+    truth, start = images.theta[0], prior.layout.view.start
+    yaw = np.arctan2(*truth[start : start + 2])
+    likely = prior.facing(np.zeros((2, prior.dim)), yaw + np.array([0, np.pi]))
+    drawn = np.concatenate([prior.initial(np.random.default_rng(1), 200), truth[None]])
+    monkeypatch.setattr(inference, "refine", lambda prior, observed, starts, keep: starts)
+    starts = inference.modes_of(prior, observed(images, 0), likely, drawn)
+    np.testing.assert_array_equal(starts[:2], likely)
+    assert truth.tolist() in starts.tolist()
+    quarters = refinement.quarters_of(prior, starts)
+    assert sorted(quarters[2:]) == sorted(np.repeat(quarters[:2], inference._STARTS // 2))
+
+
+def test_reconstructions_use_one_thread(animal, monkeypatch, two_threads) -> None:
+    """Modes, and the draws about them."""
+    category, prior, images = animal
+    monkeypatch.setattr(inference, "refine", lambda *args, keep: torch.get_num_threads())
+    assert inference.posterior_modes(encoder_of(category), prior, observed(images, 0)) == 1
+    threads = []
+
+    def draws(modes, rng, n):
+        threads.append(torch.get_num_threads())
+        return images.theta[[0] * n]
+
+    mode = Mode(images.theta[0], 0.0, np.eye(prior.dim))
+    monkeypatch.setattr(inference, "posterior_modes", lambda *args: [mode])
+    monkeypatch.setattr(inference, "mixture_draws", draws)
+    reconstruct(observed(images, 0), category, draws=2)
+    assert threads == [1]
+
+
+def test_the_best_of_each_quarter_turn_goes_on_first(animal) -> None:
+    _, prior, _ = animal
+    quarters = np.array([0, 0, 0, 1, 1, 2])
+    theta = torch.as_tensor(prior.facing(np.zeros((6, prior.dim)), quarters * np.pi / 2))
+    reached = [(point, -float(k)) for k, point in enumerate(theta)]
+    order = [value for _, value in refinement._diverse(prior, reached)]
+    assert order == [-0.0, -3.0, -5.0, -1.0, -4.0, -2.0]
+
+
+@pytest.mark.parametrize(("softness", "difference"), [(1.0, 0.05), (2.0, 0.1), (8.0, 0.15)])
+def test_differences_are_larger_for_soft_likelihoods(animal, monkeypatch, softness, difference):
+    _, prior, images = animal
+    likelihood = replace(
+        ImageLikelihood.of(observed(images, 0), 32, torch.float64, np.zeros(0)), softness=softness
+    )
+    # Images whose only pixel is the sum of squares of θ: its difference is 2 θ + h.
+    monkeypatch.setattr(refinement, "_images", lambda prior, theta, _: (theta**2).sum(dim=1))
+    theta = torch.linspace(-1, 1, 5, dtype=torch.float64)
+    found = refinement._derivatives(prior, theta, (theta**2).sum(), likelihood)
+    np.testing.assert_allclose(found, 2 * theta + difference)
 
 
 def test_draws_of_a_mode_have_its_moments() -> None:
