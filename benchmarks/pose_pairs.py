@@ -29,9 +29,9 @@ from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.metrics.chains import chain_diagnostics
 from probmotion.posteriors.problem import Problem
 from probmotion.problems import pairs_problem
-from probmotion.problems.references.tempered_pairs import TemperedPairs
 from probmotion.samplers import MetropolisHastings
 from probmotion.samplers.mcmc.proposals import Isotropic
+from probmotion.samplers.mcmc.tempered_pairs import TemperedPairs
 from probmotion.threads import one_thread
 
 CHAINS, WARMUP, DRAWS = 32, 300, 400

@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from probmotion.data.synthetic import animal_clips, synthetic_walks, walk_clips
+from probmotion.data.person_clips import moving_clips
+from probmotion.data.synthetic import animal_clips
 from probmotion.models.bodies.turn_fit import fit_turns
 from probmotion.models.images.category import Category
 from probmotion.models.images.encoder_training import EncoderTrainee, encoder_of
@@ -71,7 +72,7 @@ Command: `python notebooks/ship_images.py {name} --data ../shared/data --out run
 
 PROVENANCE = {
     "quadruped": "`animal-vae.md`",
-    "person": "`walk-vae.md`; synthetic walks are this project's",
+    "person": "walking, running and jumping of the training part of `motion2d.md`",
 }
 
 
@@ -79,7 +80,7 @@ def clips_of(name: str, data: Path) -> list[Motion]:
     """Return the clips whose poses a category has; test and validation clips are not among them."""
     if name == "quadruped":
         return animal_clips(data)["train"]
-    return [*walk_clips(data)["train"], *synthetic_walks(60)]
+    return moving_clips(data)["train"]
 
 
 def windows_of(clips: Sequence[Motion], skeleton: Skeleton, fps: float) -> np.ndarray:
@@ -116,7 +117,9 @@ def main() -> None:
     draws = code.turns(np.random.default_rng(0).standard_normal((500, DIM)))
     speed = speed_of(category, draws) / speed_of(category, fit.turns)
     card = {"clips": sorted(clip.name for clip in clips), "windows": len(windows)}
-    replace(category, card=card).save(WEIGHTS / f"{name}-images.npz")
+    lengths = max(category.length_spread, float(np.sqrt((fit.log_lengths**2).mean())))
+    category = replace(category, card=card, length_spread=lengths)
+    category.save(WEIGHTS / f"{name}-images.npz")
     category = Category.load(name)
     results = []
     for settings in (TRAINING, SILHOUETTES):

@@ -16,4 +16,5 @@ from .mcmc.metropolis import MetropolisHastings as MetropolisHastings
 from .mcmc.nuts import NUTS as NUTS
 from .mcmc.smc import SequentialMonteCarlo as SequentialMonteCarlo
 from .mcmc.tempered import ParallelTempering as ParallelTempering
+from .mcmc.tempered_pairs import TemperedPairs as TemperedPairs
 from .variational.dvae import DVAEInference as DVAEInference

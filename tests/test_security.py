@@ -24,7 +24,7 @@ from probmotion.models.pose_pairs.joint_limits import JointLimits
 from probmotion.models.unseen_depth.annotation_prior import AnnotationPrior
 from probmotion.plots.animation import animate_skeletons, animated_page
 from probmotion.plots.skeletons import draw_skeletons
-from probmotion.problems.references.chains import StoredChain
+from probmotion.samplers.mcmc.stored_chain import StoredChain
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = [

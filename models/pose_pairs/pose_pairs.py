@@ -8,10 +8,13 @@ import numpy as np
 
 from probmotion.arrays import Array, to_numpy
 from probmotion.data.pair_sets import check_close_people
+from probmotion.interaction.annotated_pairs import AnnotatedPairs
 from probmotion.models.pose_pairs.joint_limits import JointLimits
+from probmotion.models.pose_pairs.pair_walks import PairWalks
 from probmotion.models.pose_pairs.penetration import penetration_depth
 from probmotion.models.pose_pairs.pose_chart import PoseChart
 from probmotion.motion.skeleton import Skeleton
+from probmotion.posteriors.protocols import Likelihood
 from probmotion.validation import check_count, check_positive, check_shape
 
 __all__ = ["PosePairPrior"]
@@ -149,6 +152,13 @@ class PosePairPrior:
         ``joint_speeds`` contains each joint's mean squared turn, radians², and stretch, metres².
         """
         return self.chart.speeds(joint_speeds[..., 0], joint_speeds[..., 1])
+
+    def walks(self, likelihood: Likelihood | None) -> PairWalks | None:
+        """Return walks over poses and views, or None unless annotations show all joints."""
+        if type(likelihood) is not AnnotatedPairs or not likelihood.annotations.visible.all():
+            return None
+        settings = self.penetration_weight, self.position_noise, self.max_invalid
+        return PairWalks.of(self.chart, self.joint_limits, likelihood, *settings)
 
     def invalid_joints(self, pose: np.ndarray) -> list[str]:
         """Return the names of the joints of a pose (J, 3) beyond the limits."""

@@ -32,6 +32,7 @@ __all__ = [
     "HasManifold",
     "HasSeeds",
     "HasStyles",
+    "HasWalks",
     "InferenceNetwork",
     "Likelihood",
     "Marginalises",
@@ -39,6 +40,7 @@ __all__ = [
     "MotionPrior",
     "NotConjugate",
     "Samplable",
+    "Walks",
 ]
 
 
@@ -125,6 +127,61 @@ class HasSeeds(Protocol):
 
     def seed_coordinates(self) -> np.ndarray:
         """Return θ of the seeds, (S, dim); chain k starts at seed k mod S."""
+
+
+class Walks(Protocol):
+    """Markov kernels over poses and single views v of a likelihood that is a mean over views.
+
+    They target p(X, v) ∝ p(X) L(X; v)^β for powers β in [0, 1]; at β = 1, poses are draws of the
+    posterior. ``terms`` are those of the log prior of a pose, stored with it.
+    """
+
+    @property
+    def n_views(self) -> int:
+        """Number of views."""
+
+    @property
+    def moves(self) -> np.ndarray:
+        """One row per kind of move, (n_moves, …)."""
+
+    def terms(self, pose: np.ndarray) -> np.ndarray:
+        """Return the terms of the log prior, (…,), of a pose (J, 3)."""
+
+    def log_view(self, pose: np.ndarray, view: int) -> float:
+        """Return log L(X; v)."""
+
+    def log_density(self, pose: np.ndarray, terms: np.ndarray) -> float:
+        """Return the log posterior density relative to the base measure."""
+
+    def walk(
+        self,
+        pose: np.ndarray,
+        terms: np.ndarray,
+        view: int,
+        power: float,
+        steps: int,
+        sizes: np.ndarray,
+        tried: np.ndarray,
+        taken: np.ndarray,
+        rng: np.random.Generator,
+    ) -> tuple[int, float]:
+        """Take Metropolis steps at a power; return the view and its log likelihood.
+
+        ``sizes`` (n_moves,) scale the moves. ``pose``, ``terms`` and the numbers of tried and taken
+        moves (n_moves,) are updated in place.
+        """
+
+
+@runtime_checkable
+class HasWalks(Protocol):
+    """A prior with walks over poses of one frame for some likelihoods."""
+
+    @property
+    def seed(self) -> np.ndarray:
+        """Poses at which walks start, (S, J, 3), metres."""
+
+    def walks(self, likelihood: Likelihood | None) -> Walks | None:
+        """Return the walks, or None if the likelihood is not supported."""
 
 
 @runtime_checkable

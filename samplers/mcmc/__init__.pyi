@@ -17,3 +17,4 @@ from .proposals import (
 )
 from .smc import SequentialMonteCarlo as SequentialMonteCarlo
 from .tempered import ParallelTempering as ParallelTempering
+from .tempered_pairs import TemperedPairs as TemperedPairs

@@ -26,8 +26,8 @@ from probmotion.models.mixture import SpectralMixtureMotion
 from probmotion.motion.motion import Motion
 from probmotion.plots.skeletons import draw_skeletons
 from probmotion.posteriors import streams
-from probmotion.problems.references import chains
-from probmotion.problems.references.chains import StoredChain
+from probmotion.samplers.mcmc import stored_chain
+from probmotion.samplers.mcmc.stored_chain import StoredChain
 
 WALK = make_gait("walk", 0, frames=60, fps=30.0)
 CLIPS = "--size tiny --validation walk3 --test walk4 --batch 4 --checkpoint-every 2"
@@ -198,7 +198,7 @@ ALL = [pytest.param(n, marks=[pytest.mark.slow] if n in SLOW else [], id=n) for 
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch):
     monkeypatch.setattr(streams, "_BLOCK_BYTES", 80_000)
-    monkeypatch.setattr(chains, "_SECONDS", 0.0)
+    monkeypatch.setattr(stored_chain, "_SECONDS", 0.0)
 
 
 def contents(folder):

@@ -31,8 +31,8 @@ from probmotion.models.mixture import SpectralMixtureMotion
 from probmotion.models.training.checkpoints import load_checkpoint
 from probmotion.posteriors import streams
 from probmotion.posteriors.draws import MotionDraws
-from probmotion.problems.references import chains
-from probmotion.problems.references.chains import StoredChain
+from probmotion.samplers.mcmc import stored_chain
+from probmotion.samplers.mcmc.stored_chain import StoredChain
 
 RUN = "runs/generation/prior-draws/0"
 
@@ -122,7 +122,7 @@ KINDS = {
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch):
     monkeypatch.setattr(streams, "_BLOCK_BYTES", 80_000)
-    monkeypatch.setattr(chains, "_SECONDS", 0.0)
+    monkeypatch.setattr(stored_chain, "_SECONDS", 0.0)
 
 
 FAULTS = [(name, fault) for name in KINDS for fault in ("flipped bit", "cut file", "missing file")]

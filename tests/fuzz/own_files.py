@@ -26,8 +26,8 @@ from probmotion.models.unseen_depth.pose_depth import PoseDepth
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors import streams
 from probmotion.posteriors.reference import StoredReference
-from probmotion.problems.references.chains import StoredChain
 from probmotion.samplers.mcmc.metropolis import MetropolisHastings
+from probmotion.samplers.mcmc.stored_chain import StoredChain
 
 LEG = Skeleton(["hip", "knee"], [-1, 0])
 FINGERPRINT = "0" * 16

@@ -32,7 +32,7 @@ from probmotion.posteriors.protocols import HasSeeds, Samplable
 from probmotion.posteriors.reference import StoredReference, fingerprint_of
 from probmotion.posteriors.sampling import Sampler, load_sampler
 from probmotion.problems.references.outlier_gibbs import OutlierGibbs
-from probmotion.problems.references.tempered_pairs import TemperedPairs
+from probmotion.samplers.mcmc.tempered_pairs import TemperedPairs
 from probmotion.validation import check_count
 
 __all__ = ["ReferenceRefused", "agreement", "certify", "make_reference"]
@@ -112,7 +112,8 @@ def make_reference(
 
 
 def _default_sampler(problem: Problem) -> Sampler:
-    samplers: list[OutlierGibbs | TemperedPairs] = [OutlierGibbs(), TemperedPairs()]
+    tempered = TemperedPairs(levels=24, steps=120, warmup=2000, thin=120)
+    samplers: list[OutlierGibbs | TemperedPairs] = [OutlierGibbs(), tempered]
     for sampler in samplers:
         if sampler.draws_from(problem.posterior):
             return sampler

@@ -1,4 +1,4 @@
-"""Parallel tempering over pose pairs and single views, for reference draws.
+"""Parallel tempering over pose pairs and single views.
 
 The likelihood of a pose pair Θ is a mean over views, and the likelihood L(Θ_v; v) of view v depends
 on its nearest annotation. Modes near different annotations are far apart. The view is therefore
@@ -20,7 +20,6 @@ import time
 from collections.abc import Mapping
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from threading import Event
 from typing import Any, ClassVar
@@ -28,28 +27,19 @@ from typing import Any, ClassVar
 import numpy as np
 
 from probmotion import seeds
-from probmotion.arrays import logsumexp
-from probmotion.interaction.annotated_pairs import AnnotatedPairs
-from probmotion.interaction.annotations.local_frames import chest_joints, joint_roots
-from probmotion.interaction.annotations.views import view_vectors
-from probmotion.models.pose_pairs.penetration import capsules_of
-from probmotion.models.pose_pairs.pose_pairs import PosePairPrior
 from probmotion.posteriors.draws import MotionDraws
 from probmotion.posteriors.posterior import MotionPosterior
-from probmotion.posteriors.protocols import HasLogDensity
-from probmotion.posteriors.sampling import progress_bar
-from probmotion.posteriors.truncation import TruncatedPosterior
-from probmotion.problems.references.chains import StoredChain
-from probmotion.problems.references.pair_densities import (
-    Physics,
-    ViewAnnotations,
-    log_prior,
-    log_prior_terms,
-    log_view,
-    log_views,
+from probmotion.posteriors.protocols import HasWalks, Walks
+from probmotion.posteriors.sampling import (
+    Interrupted,
+    UnsupportedPosterior,
+    progress_bar,
+    require,
+    suited,
 )
-from probmotion.problems.references.pair_moves import Body, moves_of
-from probmotion.problems.references.pair_walk_kernels import walk
+from probmotion.posteriors.truncation import TruncatedPosterior
+from probmotion.samplers.mcmc.stored_chain import StoredChain
+from probmotion.threads import only_one_thread
 from probmotion.validation import check_count
 
 __all__ = ["TemperedPairs"]
@@ -83,12 +73,14 @@ class TemperedPairs:
     """
 
     name: ClassVar[str] = "tempered-pairs"
-    requires: ClassVar[tuple[type, ...]] = (HasLogDensity,)
+    requires: ClassVar[tuple[type, ...]] = (HasWalks,)
+    effort: ClassVar[tuple[str, ...]] = ("thin", "warmup")
+    least_effort: ClassVar[int] = _INITIAL_ROUND
 
-    levels: int = 24
-    steps: int = 120
-    warmup: int = 2000
-    thin: int = 120
+    levels: int = 20
+    steps: int = 100
+    warmup: int = 600
+    thin: int = 30
 
     def __post_init__(self) -> None:
         check_count("levels", self.levels, least=3)
@@ -96,13 +88,13 @@ class TemperedPairs:
         check_count("warmup", self.warmup, least=_INITIAL_ROUND)
         check_count("thin", self.thin)
 
-    def draws_from(self, posterior: MotionPosterior) -> bool:
-        """Return whether the posterior is over pose pairs with annotations of all joints."""
+    @staticmethod
+    def draws_from(posterior: MotionPosterior) -> bool:
+        """Return whether the prior has walks for the likelihood."""
         return (
             type(posterior) in (MotionPosterior, TruncatedPosterior)
-            and type(posterior.prior) is PosePairPrior
-            and type(posterior.likelihood) is AnnotatedPairs
-            and _n_occluded(posterior) == 0
+            and isinstance(posterior.prior, HasWalks)
+            and posterior.prior.walks(posterior.likelihood) is not None
         )
 
     def sample(
@@ -121,42 +113,60 @@ class TemperedPairs:
         The state of each chain is stored twice a minute in files named after ``unfinished``, from
         which the same call resumes; the caller deletes them. Results do not depend on the number of
         threads. Each step counts as one density evaluation, although most evaluate only part of it.
+
+        Raises
+        ------
+        UnsupportedPosterior
+            If the prior has no walks for the likelihood.
+        ValueError
+            If ``initial`` is given.
+        Interrupted
+            On Ctrl-C, with the draws that all chains have finished.
         """
-        if not self.draws_from(posterior):
-            raise ValueError(
-                "posterior must have PosePairPrior and AnnotatedPairs without occluded joints, got "
-                f"{type(posterior.prior).__name__} and {type(posterior.likelihood).__name__} with "
-                f"{_n_occluded(posterior)} occluded joints"
-            )
+        walks = self._walks(posterior)
         if initial is not None:
             raise ValueError(f"initial must be None, got {type(initial).__name__}")
         check_count("draws", draws)
         check_count("chains", chains)
         start, stop = time.perf_counter(), Event()
-        arrays = pair_arrays(posterior)
-        with (
-            progress_bar(chains * draws, self.name, progress) as bar,
-            ThreadPoolExecutor(min(chains, os.cpu_count() or 1)) as threads,
-        ):
-            ladders = [
-                _Ladder(self, posterior, arrays, seeds.generator(seed, "chain", chain), chain)
-                for chain in range(chains)
-            ]
-            try:
-                futures = []
-                for chain, ladder in enumerate(ladders):
-                    path = unfinished and unfinished.with_name(f"{unfinished.name}-{chain}.npz")
-                    futures.append(threads.submit(ladder.draw, draws, bar, stop, StoredChain(path)))
-                # The first failure stops all chains.
-                for future in wait(futures, return_when=FIRST_EXCEPTION).done:
-                    future.result()
-            finally:
-                stop.set()
-            states = [future.result() for future in futures]
+        cores = 1 if only_one_thread() else os.cpu_count() or 1
+        total = chains * (self.warmup + draws * self.thin)
+        ladders: list[_Ladder] = []
+        try:
+            with (
+                progress_bar(total, self.name, progress) as bar,
+                ThreadPoolExecutor(min(chains, cores)) as threads,
+            ):
+                ladders += [
+                    _Ladder(self, posterior, walks, seeds.generator(seed, "chain", chain), chain)
+                    for chain in range(chains)
+                ]
+                try:
+                    futures = []
+                    for chain, ladder in enumerate(ladders):
+                        path = unfinished and unfinished.with_name(f"{unfinished.name}-{chain}.npz")
+                        task = threads.submit(ladder.draw, draws, bar, stop, StoredChain(path))
+                        futures.append(task)
+                    # The first failure stops all chains.
+                    for future in wait(futures, return_when=FIRST_EXCEPTION).done:
+                        future.result()
+                finally:
+                    stop.set()
+        except KeyboardInterrupt as interruption:
+            if not ladders or not all(ladder.drawn for ladder in ladders):
+                raise
+            raise Interrupted(self._result(posterior, ladders, seed, start)) from interruption
+        return self._result(posterior, ladders, seed, start)
+
+    def _result(
+        self, posterior: MotionPosterior, ladders: list[_Ladder], seed: int, start: float
+    ) -> MotionDraws:
+        """Return the draws that all chains have finished."""
+        n = min(len(ladder.drawn) for ladder in ladders)
         return MotionDraws.of(
             posterior,
             self,
-            np.stack(states)[:, :, None],
+            np.stack([np.stack(ladder.drawn[:n]) for ladder in ladders])[:, :, None],
             seed=seed,
             seconds=time.perf_counter() - start,
             statistics={
@@ -166,6 +176,19 @@ class TemperedPairs:
             counts={"density": sum(ladder.evaluations for ladder in ladders)},
         )
 
+    def _walks(self, posterior: MotionPosterior) -> Walks:
+        require(self, posterior)
+        walks = posterior.prior.walks(posterior.likelihood) if self.draws_from(posterior) else None  # type: ignore[attr-defined]
+        if walks is None:
+            raise UnsupportedPosterior(
+                self.name,
+                "needs annotations of all joints, got "
+                f"{type(posterior).__name__} with {type(posterior.likelihood).__name__}",
+                word="annotations",
+                others=suited(posterior),
+            )
+        return walks
+
 
 class _Ladder:
     """Tempering levels of one chain."""
@@ -174,27 +197,22 @@ class _Ladder:
         self,
         sampler: TemperedPairs,
         posterior: MotionPosterior,
-        arrays: tuple[Body, Physics, ViewAnnotations],
+        walks: Walks,
         rng: np.random.Generator,
         chain: int,
     ) -> None:
-        prior = posterior.prior
-        assert isinstance(prior, PosePairPrior)
-        self.sampler, self.arrays, self.rng = sampler, arrays, rng
-        body, physics, views = arrays
+        starts = posterior.prior.seed  # type: ignore[attr-defined]
+        self.sampler, self.walks, self.rng = sampler, walks, rng
         levels = sampler.levels
         self.powers = np.concatenate([[0.0], np.geomspace(_MIN_POWER, 1.0, levels - 1)])
-        self.moves = moves_of(body)
-        self.log_sizes = np.full((levels, len(self.moves)), math.log(_INITIAL_SIZE))
+        self.log_sizes = np.full((levels, len(walks.moves)), math.log(_INITIAL_SIZE))
         self.tried, self.taken = np.zeros_like(self.log_sizes), np.zeros_like(self.log_sizes)
-        pose = prior.seed[chain % len(prior.seed)]
+        pose = starts[chain % len(starts)]
         self.poses = np.repeat(pose[None], levels, axis=0)
-        self.parts = np.empty((levels, 2 + 2 * len(body.roots)))
-        log_prior_terms(pose, body, physics, self.parts[0])
-        self.parts[:] = self.parts[0]
-        self.views = rng.integers(len(views.vectors), size=levels)
+        self.parts = np.repeat(walks.terms(pose)[None], levels, axis=0)
+        self.views = rng.integers(walks.n_views, size=levels)
         # Log likelihood of the view of each level.
-        self.seen = np.array([log_view(pose, view, body, views, -np.inf) for view in self.views])
+        self.seen = np.array([walks.log_view(pose, view) for view in self.views])
         truncated = isinstance(posterior, TruncatedPosterior) and posterior.truncated
         self.cut = _TruncatedState(self, posterior) if truncated else None
         self.rejected, self.asked = np.zeros(levels - 1), 0
@@ -202,37 +220,37 @@ class _Ladder:
         # Whether a state has been at power 0 since it was last at power 1.
         self.been_down = np.zeros(levels, dtype=bool)
         self.round_trips = self.evaluations = 0
+        self.drawn: list[np.ndarray] = []
 
     @property
     def barrier(self) -> float:
         """Communication barrier Λ of Syed et al.: the sum of rejection rates over neighbours."""
         return float(self.rejected.sum() / max(self.asked, 1))
 
-    def draw(self, draws: int, bar: Any, stop: Event, file: StoredChain) -> np.ndarray:
-        """Return states of the target density, ``thin`` exchanges apart: (draws, J, 3)."""
-        states, done, stored = np.empty((draws, *self.poses.shape[1:])), 0, file.load()
+    def draw(self, draws: int, bar: Any, stop: Event, file: StoredChain) -> None:
+        """Draw states of the target density, ``thin`` exchanges apart, into ``drawn``."""
+        stored, thin = file.load(), self.sampler.thin
         if stored is None:
-            self._warm_up(stop)
+            self._warm_up(stop, bar)
         else:
-            done = len(stored["draws"])
-            states[:done] = stored["draws"]
+            self.drawn = list(stored["draws"])
             self._resume(stored)
-            bar.update(done)
-        for draw in range(done, draws):
-            for _ in range(self.sampler.thin):
+            bar.update(self.sampler.warmup + thin * len(self.drawn))
+        while len(self.drawn) < draws:
+            for _ in range(thin):
                 self._exchange_after_walking(stop)
-            states[draw] = self.poses[-1] if self.cut is None else self.cut.pose
-            bar.update(1)
-            file.save(partial(self._state, states[: draw + 1]))
-        return states
+            state = self.poses[-1] if self.cut is None else self.cut.pose
+            self.drawn.append(state.copy())
+            bar.update(thin)
+            file.save(self._state)
 
-    def _state(self, draws: np.ndarray) -> dict[str, np.ndarray]:
+    def _state(self) -> dict[str, np.ndarray]:
         """Return the draws so far and the complete state of the chain."""
         state = {
             prefix + name: np.asarray(getattr(owner, name))
             for owner, prefix, name in self._states()
         }
-        return state | {"draws": draws, "random": seeds.state_words(self.rng)}
+        return state | {"draws": np.stack(self.drawn), "random": seeds.state_words(self.rng)}
 
     def _resume(self, stored: Mapping[str, np.ndarray]) -> None:
         for owner, prefix, name in self._states():
@@ -245,7 +263,7 @@ class _Ladder:
         cut = [] if self.cut is None else [(self.cut, "cut_", name) for name in _CUT_STATE]
         return [*((self, "", name) for name in _STATE), *cut]
 
-    def _warm_up(self, stop: Event) -> None:
+    def _warm_up(self, stop: Event, bar: Any) -> None:
         """Tune step sizes after every exchange and powers after rounds of growing length."""
         end_of_round = length = _INITIAL_ROUND
         for number in range(1, self.sampler.warmup + 1):
@@ -255,6 +273,7 @@ class _Ladder:
             change = np.where(tried, 2 * surplus, 0.0) / math.sqrt(number)
             self.log_sizes = np.minimum(self.log_sizes + change, math.log(_MAX_SIZE))
             self.tried[:], self.taken[:] = 0, 0
+            bar.update(1)
             if number == end_of_round:
                 self._set_powers()
                 # Extend the last round, as the final powers depend on it.
@@ -280,17 +299,15 @@ class _Ladder:
             raise KeyboardInterrupt
         sizes = np.exp(self.log_sizes)
         for level, power in enumerate(self.powers):
-            self.views[level], self.seen[level] = walk(
+            self.views[level], self.seen[level] = self.walks.walk(
                 self.poses[level],
                 self.parts[level],
                 self.views[level],
                 power,
                 self.sampler.steps,
-                self.moves,
                 sizes[level],
                 self.tried[level],
                 self.taken[level],
-                *self.arrays,
                 self.rng,
             )
         self.evaluations += self.sampler.steps * len(self.poses)
@@ -346,47 +363,5 @@ class _TruncatedState:
 
     def _log_ratio(self, ladder: _Ladder) -> float:
         """Return log f*/f of the top level, with f relative to the base measure."""
-        body, physics, views = ladder.arrays
-        parts, logs = ladder.parts[-1], log_views(ladder.poses[-1], body, views)
-        log_f = log_prior(parts, physics) - parts[0] + logsumexp(logs) - math.log(len(logs))
+        log_f = ladder.walks.log_density(ladder.poses[-1], ladder.parts[-1])
         return min(0.0, self.cap - log_f) if log_f >= self.floor else -math.inf
-
-
-def pair_arrays(posterior: MotionPosterior) -> tuple[Body, Physics, ViewAnnotations]:
-    """Return the arguments of the compiled functions for a posterior over pose pairs."""
-    prior, likelihood = posterior.prior, posterior.likelihood
-    assert isinstance(prior, PosePairPrior)
-    assert isinstance(likelihood, AnnotatedPairs)
-    skeleton, limits = prior.skeleton, prior.joint_limits
-    parents = np.array(skeleton.parents, dtype=np.int64)
-    below = np.eye(skeleton.n_joints, dtype=bool)
-    for joint in range(skeleton.n_joints):
-        below[list(skeleton.ancestors(joint)), joint] = True
-    roots = np.array(skeleton.roots)
-    body = Body(
-        parents=parents,
-        below=below,
-        roots=roots,
-        chests=np.array(chest_joints(skeleton)),
-        person=np.searchsorted(roots, joint_roots(skeleton)),
-        seed=prior.seed[0],
-        bone_noise=prior.bone_noise,
-        root_noise=prior.root_noise,
-    )
-    physics = Physics(
-        limits.trees,
-        limits.arrays,
-        *capsules_of(skeleton),
-        prior.penetration_weight,
-        prior.position_noise,
-        prior.max_invalid,
-    )
-    vectors, prepared = view_vectors(likelihood.views), likelihood.comparer.prepared
-    views = ViewAnnotations(vectors, likelihood.near, prepared, likelihood.noise)
-    return body, physics, views
-
-
-def _n_occluded(posterior: MotionPosterior) -> int:
-    """Return the number of occluded annotated joints."""
-    annotations = getattr(posterior.likelihood, "annotations", None)
-    return 0 if annotations is None else int((~annotations.visible).sum())

@@ -17,25 +17,16 @@ from probmotion.interaction.geometry.nearest_kernels import (
     prepare_projection,
 )
 from probmotion.models.pose_pairs.joint_limits_kernels import LimitArrays, project_poses
+from probmotion.models.pose_pairs.pair_moves import Body, log_root_positions
 from probmotion.models.pose_pairs.penetration_kernels import total_depths
-from probmotion.problems.references.pair_moves import Body, log_root_positions
 
 __all__ = [
-    "Physics",
-    "ViewAnnotations",
-    "log_annotations",
-    "log_measure",
-    "log_penetration",
-    "log_prior",
-    "log_prior_terms",
-    "log_surrogate",
-    "log_view",
-    "log_views",
-    "project_to_view",
-    "write_limit_terms",
-]
+    "Physics", "Vector", "ViewAnnotations", "image_axes", "log_annotations", "log_measure",
+    "log_penetration", "log_prior", "log_prior_terms", "log_surrogate", "log_view", "log_views",
+    "project_to_view", "write_limit_terms",
+]  # fmt: skip
 
-_Vector = tuple[float, float, float]
+Vector = tuple[float, float, float]
 
 
 class Physics(NamedTuple):
@@ -191,6 +182,20 @@ def project_to_view(pose: np.ndarray, view: int, body: Body, views: ViewAnnotati
     Equals :func:`~probmotion.interaction.annotations.views.project_to_views` up to a rotation in
     the image plane, which the alignment with annotations removes.
     """
+    right, up, _ = image_axes(pose, view, body, views)
+    image = np.empty((len(pose), 2))
+    for joint in range(len(pose)):
+        x, y, z = pose[joint, 0], pose[joint, 1], pose[joint, 2]
+        image[joint, 0] = right[0] * x + right[1] * y + right[2] * z
+        image[joint, 1] = up[0] * x + up[1] * y + up[2] * z
+    return image
+
+
+@numba.njit(cache=True, nogil=True)
+def image_axes(
+    pose: np.ndarray, view: int, body: Body, views: ViewAnnotations
+) -> tuple[Vector, Vector, Vector]:
+    """Return two axes of the image plane of a view, and the direction towards the viewer."""
     i, j, k = _local_frame(pose, body)
     a, b, c = views.vectors[view]
     x, y, z = (
@@ -204,17 +209,11 @@ def project_to_view(pose: np.ndarray, view: int, body: Body, views: ViewAnnotati
     if x <= y and x <= z:
         across = (1.0, 0.0, 0.0)
     right = _unit(_cross(across, towards))
-    up = _cross(towards, right)
-    image = np.empty((len(pose), 2))
-    for joint in range(len(pose)):
-        x, y, z = pose[joint, 0], pose[joint, 1], pose[joint, 2]
-        image[joint, 0] = right[0] * x + right[1] * y + right[2] * z
-        image[joint, 1] = up[0] * x + up[1] * y + up[2] * z
-    return image
+    return right, _cross(towards, right), towards
 
 
 @numba.njit(cache=True, nogil=True)
-def _local_frame(pose: np.ndarray, body: Body) -> tuple[_Vector, _Vector, _Vector]:
+def _local_frame(pose: np.ndarray, body: Body) -> tuple[Vector, Vector, Vector]:
     """Return i, j, k of :func:`~probmotion.interaction.annotations.local_frames.local_frames`."""
     x, y, z = 0.0, 0.0, 0.0
     for person in range(len(body.roots)):
@@ -227,17 +226,17 @@ def _local_frame(pose: np.ndarray, body: Body) -> tuple[_Vector, _Vector, _Vecto
 
 # Tuples avoid the allocation of small arrays.
 @numba.njit(cache=True, nogil=True)
-def _between(pose: np.ndarray, start: int, end: int) -> _Vector:
+def _between(pose: np.ndarray, start: int, end: int) -> Vector:
     (a, b, c), (x, y, z) = pose[start], pose[end]
     return (x - a, y - b, z - c)
 
 
 @numba.njit(cache=True, nogil=True)
-def _unit(v: _Vector) -> _Vector:
+def _unit(v: Vector) -> Vector:
     size = max(np.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2), 1e-300)
     return (v[0] / size, v[1] / size, v[2] / size)
 
 
 @numba.njit(cache=True, nogil=True)
-def _cross(a: _Vector, b: _Vector) -> _Vector:
+def _cross(a: Vector, b: Vector) -> Vector:
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])

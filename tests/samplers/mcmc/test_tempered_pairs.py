@@ -1,4 +1,4 @@
-"""Tempered reference draws of pose pairs: density, measure, moves, truncation and resuming."""
+"""Tempering of pose pairs: density, measure, moves, truncation and resuming."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import signal
 import threading
 from dataclasses import replace
 from threading import Event
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -17,12 +18,8 @@ from probmotion import MotionPosterior
 from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.interaction.annotated_pairs import AnnotatedPairs
 from probmotion.interaction.annotations.sources import draw_annotations
-from probmotion.models.pose_pairs.pose_pairs import PosePairPrior
-from probmotion.posteriors.truncation import TruncatedPosterior
-from probmotion.problems import load_problem
-from probmotion.problems.references import chains, tempered_pairs
-from probmotion.problems.references.chains import StoredChain
-from probmotion.problems.references.pair_densities import (
+from probmotion.models.pose_pairs.pair_densities import (
+    image_axes,
     log_annotations,
     log_prior,
     log_prior_terms,
@@ -30,9 +27,15 @@ from probmotion.problems.references.pair_densities import (
     log_views,
     project_to_view,
 )
-from probmotion.problems.references.pair_moves import HINGE, STRETCH, moves_of, propose
-from probmotion.problems.references.pair_walk_kernels import walk
-from probmotion.problems.references.tempered_pairs import TemperedPairs, pair_arrays
+from probmotion.models.pose_pairs.pair_moves import APPROACH, HINGE, STRETCH, moves_of, propose
+from probmotion.models.pose_pairs.pair_walk_kernels import approach, walk
+from probmotion.models.pose_pairs.pose_pairs import PosePairPrior
+from probmotion.posteriors.sampling import Interrupted
+from probmotion.posteriors.truncation import TruncatedPosterior
+from probmotion.problems import load_problem
+from probmotion.samplers.mcmc import stored_chain, tempered_pairs
+from probmotion.samplers.mcmc.stored_chain import StoredChain
+from probmotion.samplers.mcmc.tempered_pairs import TemperedPairs
 
 # One in 100 000 normal variables exceeds this z-score.
 _MAX_Z = 4.4
@@ -69,6 +72,11 @@ def exact(prior):
         length = length * np.exp(prior.bone_noise * rng.standard_normal((n, 1)))
         poses[:, joint] = poses[:, parent] + length * direction
     return poses
+
+
+def pair_arrays(posterior):
+    walks = posterior.prior.walks(posterior.likelihood)
+    return walks.body, walks.physics, walks.views
 
 
 def test_compiled_density_matches_the_posterior(prior, likelihood):
@@ -125,6 +133,8 @@ def test_moves_preserve_bone_lengths(prior, likelihood):
     proposed = np.empty_like(pose)
     for move in moves_of(body):
         kind, joint, other = move
+        if kind == APPROACH:
+            continue
         propose(pose, move, 0.5, body, rng, proposed)
         assert np.abs(proposed - pose).max() > 1e-6
         after = np.linalg.norm(proposed[ends] - proposed[starts], axis=1)
@@ -134,6 +144,59 @@ def test_moves_preserve_bone_lengths(prior, likelihood):
         if kind == HINGE:
             shift = proposed[[joint, other]] - pose[[joint, other]]
             np.testing.assert_allclose(shift[0], shift[1], atol=1e-12)
+
+
+@pytest.mark.parametrize("person", [-1, 0, 1])
+def test_an_approach_is_inverted_by_its_inverse(prior, likelihood, person):
+    """Angles to the annotation's bones are scaled; the frame and bone lengths stay."""
+    body, _, views = pair_arrays(MotionPosterior(prior, likelihood))
+    rng, done = np.random.default_rng(0), 0
+    root = -1 if person < 0 else int(body.roots[person])
+    for number in range(60):
+        view, annotation = number % 5, views.near[number % 5, number % 4]
+        pose = prior.seed[0] + 0.02 * rng.standard_normal(prior.seed[0].shape)
+        new, back = np.empty_like(pose), np.empty_like(pose)
+        log_volume = approach(pose, root, 0.8, view, annotation, body, views, new)
+        if log_volume == -np.inf:
+            continue
+        done += 1
+        inverse = approach(new, root, 1 / 0.8, view, annotation, body, views, back)
+        assert inverse == pytest.approx(-log_volume, rel=1e-6)
+        np.testing.assert_allclose(back, pose, atol=1e-9)
+        axes = image_axes(pose, view, body, views)
+        np.testing.assert_allclose(image_axes(new, view, body, views), axes, atol=1e-12)
+        ends, starts = np.array(prior.skeleton.bones).T
+        before, after = pose[ends] - pose[starts], new[ends] - new[starts]
+        np.testing.assert_allclose(*(np.linalg.norm(b, axis=1) for b in (before, after)))
+        moved = np.abs(after - before).max(axis=1) > 1e-9
+        own = np.ones(len(ends), bool) if person < 0 else body.person[ends] == person
+        assert (moved == (own & ~body.framing[ends])).all()
+    assert done > 20
+
+
+def test_the_volume_of_an_approach_is_that_of_solid_angles(prior, likelihood):
+    """The area of a small triangle of directions of each bone changes by a known factor."""
+    body, _, views = pair_arrays(MotionPosterior(prior, likelihood))
+    pose, view = prior.seed[0], 1
+    annotation, new = views.near[view, 0], np.empty_like(pose)
+    total = approach(pose, -1, 1.1, view, annotation, body, views, new)
+    assert np.isfinite(total)
+    factors, size = [], 1e-5
+    for joint in np.flatnonzero(~body.framing):
+        bone = pose[joint] - pose[body.parents[joint]]
+        first = np.cross(bone, [0.3, 0.5, 0.8])
+        first /= np.linalg.norm(first)
+        second = np.cross(bone, first) / np.linalg.norm(bone)
+        mapped = []
+        for side in (np.zeros(3), first, second):
+            turned = bone + size * np.linalg.norm(bone) * side
+            turned *= np.linalg.norm(bone) / np.linalg.norm(turned)
+            moved = pose + np.where(body.below[joint], 1, 0)[:, None] * (turned - bone)
+            approach(moved, -1, 1.1, view, annotation, body, views, new)
+            mapped.append((new[joint] - new[body.parents[joint]]) / np.linalg.norm(bone))
+        area = np.linalg.norm(np.cross(mapped[1] - mapped[0], mapped[2] - mapped[0]))
+        factors.append(math.log(area / size**2))
+    assert total == pytest.approx(sum(factors), abs=1e-2)
 
 
 def test_walk_updates_its_terms_correctly(prior, likelihood):
@@ -248,7 +311,7 @@ def test_interrupted_run_resumes_bit_identically(prior, likelihood, cut, monkeyp
     sampler = TemperedPairs(levels=3, steps=30, warmup=20, thin=3)
     options = {"draws": 12, "chains": 2, "seed": 4, "progress": False}
     uninterrupted = sampler.sample(posterior, **options)
-    monkeypatch.setattr(chains, "_SECONDS", 0.0)
+    monkeypatch.setattr(stored_chain, "_SECONDS", 0.0)
     save = StoredChain.save
 
     def stopping(file, state):
@@ -258,8 +321,12 @@ def test_interrupted_run_resumes_bit_identically(prior, likelihood, cut, monkeyp
 
     with monkeypatch.context() as patch:
         patch.setattr(StoredChain, "save", stopping)
-        with pytest.raises(KeyboardInterrupt):
+        with pytest.raises(Interrupted) as interruption:
             sampler.sample(posterior, **options, unfinished=tmp_path / "run")
+    finished = interruption.value.draws.dataset["positions"]
+    assert 0 < finished.sizes["draw"] < 12
+    first = {"draw": slice(finished.sizes["draw"])}
+    assert np.array_equal(finished, uninterrupted.dataset["positions"].isel(first))
     exchange, calls = tempered_pairs._Ladder._exchange_after_walking, []
     monkeypatch.setattr(
         tempered_pairs._Ladder,
@@ -293,9 +360,9 @@ def test_chains_start_at_successive_seeds(prior, likelihood, dances):
     """The base measure is relative to the first seed."""
     two_seeds = np.stack([prior.seed[0], dances[1].positions[40]])
     posterior = MotionPosterior(replace(prior, seed=two_seeds), likelihood)
-    arrays, rng = pair_arrays(posterior), np.random.default_rng(0)
+    walks, rng = posterior.prior.walks(likelihood), np.random.default_rng(0)
     for chain, seed in enumerate((0, 1, 0)):
-        ladder = tempered_pairs._Ladder(TemperedPairs(), posterior, arrays, rng, chain)
+        ladder = tempered_pairs._Ladder(TemperedPairs(), posterior, walks, rng, chain)
         assert (ladder.poses == two_seeds[seed]).all()
         theta = posterior.prior.seed_coordinates()[seed]
         stretches, translations = theta[12:].reshape(-1, 3)[:, 2], theta[6:12]
@@ -307,8 +374,8 @@ def test_chains_start_at_successive_seeds(prior, likelihood, dances):
 def test_tuned_powers_have_equal_rejection_rates(prior, likelihood):
     posterior = MotionPosterior(prior, replace(likelihood, noise=0.05))
     sampler, rng = TemperedPairs(levels=10, steps=40, warmup=500, thin=1), np.random.default_rng(0)
-    ladder = tempered_pairs._Ladder(sampler, posterior, pair_arrays(posterior), rng, 0)
-    ladder._warm_up(Event())
+    ladder = tempered_pairs._Ladder(sampler, posterior, prior.walks(posterior.likelihood), rng, 0)
+    ladder._warm_up(Event(), Mock())
     assert (ladder.powers[0], ladder.powers[-1]) == (0.0, 1.0)
     for _ in range(600):
         ladder._exchange_after_walking(Event())
@@ -325,9 +392,9 @@ def test_unsuitable_posteriors_are_rejected(prior, likelihood):
     visible[0, 3] = False
     occluded = AnnotatedPairs(replace(likelihood.annotations, visible=visible), n_views=2)
     for posterior, message in (
-        (load_problem("gait-monocular").posterior, "got GaussianMixtureMotion and Keypoints2D"),
-        (MotionPosterior(prior), "got PosePairPrior and NoneType with 0"),
-        (MotionPosterior(prior, occluded), "and AnnotatedPairs with 1"),
+        (load_problem("gait-monocular").posterior, "needs a prior with HasWalks, got Gaussian"),
+        (MotionPosterior(prior), "annotations of all joints, got MotionPosterior with NoneType"),
+        (MotionPosterior(prior, occluded), "joints, got MotionPosterior with AnnotatedPairs"),
     ):
         with pytest.raises(ValueError, match=message):
             TemperedPairs().sample(posterior, progress=False)

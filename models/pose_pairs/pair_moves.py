@@ -15,18 +15,15 @@ import numpy as np
 from probmotion.extras import numba
 
 __all__ = [
-    "HINGE",
-    "SHIFT",
-    "STRETCH",
-    "TURN",
-    "Body",
-    "log_root_positions",
-    "moves_of",
-    "propose",
-    "resample_placement",
-]
+    "APPROACH", "HINGE", "SHIFT", "STRETCH", "TURN", "Body", "log_root_positions", "moves_of",
+    "propose", "resample_placement",
+]  # fmt: skip
 
-SWING, SLIDE, STRETCH, CRANK, HINGE, TURN, SHIFT = range(7)  # kinds of moves of propose
+SWING, SLIDE, STRETCH, CRANK, HINGE, TURN, SHIFT, APPROACH = range(8)
+"""Kinds of moves, all but the last by :func:`propose`."""
+_APPROACHES = 40
+"""Number of moves of the last kind for all people, and for each person half of them. They change
+the likelihood most."""
 _UNIFORM_ANGLES = 0.3
 """Probability of a uniform angle for cranks and hinges."""
 
@@ -35,14 +32,16 @@ class Body(NamedTuple):
     """Skeleton and seed pose of two or more people.
 
     ``parents`` (J,), −1 for roots; ``below[j, k]``: whether joint k is joint j or a descendant;
-    ``roots``, ``chests`` (K,): joints; ``person`` (J,): 0 to K − 1; ``seed`` (J, 3), metres. The
-    noises are standard deviations of log bone lengths and of root positions, metres.
+    ``roots``, ``chests`` (K,): joints; ``framing`` (J,): whether the local frame depends on the
+    joint or on a descendant; ``person`` (J,): 0 to K − 1; ``seed`` (J, 3), metres. The noises are
+    standard deviations of log bone lengths and of root positions, metres.
     """
 
     parents: np.ndarray
     below: np.ndarray
     roots: np.ndarray
     chests: np.ndarray
+    framing: np.ndarray
     person: np.ndarray
     seed: np.ndarray
     bone_noise: float
@@ -52,7 +51,8 @@ class Body(NamedTuple):
 def moves_of(body: Body) -> np.ndarray:
     """Return all moves, (n_moves, 3): kind, joint or root, and second joint or −1.
 
-    The second joint is a crank's only child or a hinge's sibling.
+    The second joint is a crank's only child or a hinge's sibling. A move of the last kind is of the
+    person of a root, or of all people if it is −1.
     """
     joints = range(len(body.parents))
     bones = np.flatnonzero(body.parents >= 0).tolist()
@@ -61,6 +61,8 @@ def moves_of(body: Body) -> np.ndarray:
     moves += [(CRANK, joint, children[joint][0]) for joint in bones if len(children[joint]) == 1]
     moves += [(HINGE, *pair) for siblings in children for pair in combinations(siblings, 2)]
     moves += [(kind, root, -1) for kind in (TURN, SHIFT) for root in body.roots]
+    moves += [(APPROACH, -1, -1)] * _APPROACHES
+    moves += [(APPROACH, root, -1) for root in body.roots for _ in range(_APPROACHES // 2)]
     return np.array(moves, dtype=np.int64)
 
 
