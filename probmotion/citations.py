@@ -98,6 +98,14 @@ CITATIONS: Mapping[str, tuple[str, ...]] = {
         "scalable highly parallel MCMC scheme. JRSS B 84.",
         _HMC,
     ),
+    "tempered-pairs": (
+        "Syed, Bouchard-Côté, Deligiannidis, Doucet (2022). Non-reversible parallel tempering: a "
+        "scalable highly parallel MCMC scheme. JRSS B 84.",
+        "Liu (2001). Monte Carlo strategies in scientific computing. Springer. Section 9.4.3: "
+        "surrogate transitions.",
+        "Christen, Fox (2005). Markov chain Monte Carlo using an approximation. J. Comput. Graph. "
+        "Stat. 14.",
+    ),
     "smc": (
         "Del Moral, Doucet, Jasra (2006). Sequential Monte Carlo samplers. JRSS B 68.",
         "Neal (2001). Annealed importance sampling. Statistics and Computing 11.",

@@ -58,7 +58,7 @@ class PairWalks:
             below=below,
             roots=roots,
             chests=chests,
-            framing=below[:, chests].any(axis=1),
+            framing=np.asarray(below[:, chests].any(axis=1)),
             person=np.searchsorted(roots, joint_roots(skeleton)),
             seed=chart.seed,
             bone_noise=chart.bone_noise,

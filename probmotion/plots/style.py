@@ -66,6 +66,7 @@ _SAMPLERS = {
     "nuts": SamplerStyle("#0747E3", "s"),
     "ensemble": SamplerStyle("#C08901", "P"),
     "tempered": SamplerStyle("#60A060", "*"),
+    "tempered-pairs": SamplerStyle("#240C9C", "8"),
     "smc": SamplerStyle("#000060", "d"),
     "dvae": SamplerStyle("#146E55", "^"),
 }

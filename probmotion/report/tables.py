@@ -29,6 +29,7 @@ _MARKERS = {
     "p": "M0-6L5.7-1.9L3.5 4.9H-3.5L-5.7-1.9z",
     "<": "M-6 0L4.5-5.5v11z",
     ">": "M6 0L-4.5-5.5v11z",
+    "8": "M-2.1-5.1h4.2l3 3v4.2l-3 3h-4.2l-3-3v-4.2z",
     "h": "M0 -5 4.33 -2.5 4.33 2.5 0 5 -4.33 2.5 -4.33 -2.5Z",
 }
 """SVG paths of the markers of :func:`~probmotion.plots.style.sampler_style`."""

@@ -74,12 +74,12 @@ class TemperedPairs:
 
     name: ClassVar[str] = "tempered-pairs"
     requires: ClassVar[tuple[type, ...]] = (HasWalks,)
-    effort: ClassVar[tuple[str, ...]] = ("thin", "warmup")
+    effort: ClassVar[tuple[str, ...]] = ("warmup", "thin")
     least_effort: ClassVar[int] = _INITIAL_ROUND
 
     levels: int = 20
     steps: int = 100
-    warmup: int = 600
+    warmup: int = 300
     thin: int = 30
 
     def __post_init__(self) -> None:
