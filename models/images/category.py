@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from probmotion.arrays import Array
+from probmotion.extras import skimage  # noqa: F401  Its extra has all other libraries, too.
 from probmotion.files import read_arrays, written_whole
 from probmotion.models.bodies.articulated_body import ArticulatedBody
 from probmotion.models.images.posing import Skin
@@ -174,10 +175,10 @@ class Category:
         """Raise ``ValueError`` if there are image features (…, F') that are not of F channels."""
         known = self.features.shape[1]
         if features is not None and features.shape[-1] != known:
+            rule = f"have {known} channels" if known else "be left out"
             raise ValueError(
-                f"category {self.name} must have image features of {features.shape[-1]} channels, "
-                f"got {known or 'none'}; leave the features out, or train a category on images "
-                "with such features"
+                f"features must {rule} for the category {self.name}, got {features.shape[-1]} "
+                "channels; train a category on images with such features to use them"
             )
 
     def save(self, path: str | Path) -> None:

@@ -7,7 +7,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from probmotion.files import read_arrays
 from probmotion.io.errors import MotionFileError, errors_in, read_bytes
@@ -127,6 +127,8 @@ def _decoded(path: Path) -> Image.Image:
             frames = getattr(image, "n_frames", 1)
             orientation = image.getexif().get(_ORIENTATION, 1)
             image.load()
+        except UnidentifiedImageError as error:
+            raise ValueError("expected an undamaged image, such as PNG or JPEG") from error
         except Exception as error:  # damaged files raise many types, including SyntaxError
             raise ValueError(f"expected an undamaged image ({str(error)[:80]})") from error
     # Photographs in the format MPO contain previews of themselves.

@@ -11,7 +11,6 @@ from probmotion.interaction.geometry.nearest_kernels import (
     INTERACTION,
     Prepared,
     annotation_graph_distance,
-    centred,
     distances_to,
     nearest_candidate,
     prepare_projection,
@@ -127,12 +126,13 @@ def log_surrogate(
 
     ``errors`` (2, J) and ``terms`` (edges,) are workspace arrays.
     """
-    image = project_to_view(pose, view, body, views)
     if views.prepared.measure == INTERACTION:
-        image = centred(image)
+        # Neither the rotation nor differences of joints depend on the middle.
+        image = project_to_view(pose, view, body, views).T
         distance = annotation_graph_distance(image, annotation, views.prepared, errors, terms)
     else:
         # Distances without a graph have no cheaper surrogate.
+        image = project_to_view(pose, view, body, views)
         prepared, distances = prepare_projection(image, views.prepared), np.empty(1)
         distances_to(prepared, np.array([annotation]), views.prepared, distances)
         distance = distances[0]

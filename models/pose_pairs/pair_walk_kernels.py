@@ -142,16 +142,18 @@ def _surrogate_walk(
         log_ratio = new_parts[0] - parts[0] + power * (new - current) + log_volume
         if not -rng.standard_exponential() < log_ratio:
             continue
-        new_parts[1] = log_penetration(proposed, physics)
         lower_bound = log_prior(parts, physics) - parts[0] - rng.standard_exponential()
-        # Joint limits only decrease the density, so penetration alone may suffice to reject.
-        if new_parts[1] < lower_bound:
-            continue
+        new_parts[1] = 0.0
         if kind == APPROACH and joint < 0:
             for person in range(len(body.roots)):
                 write_limit_terms(proposed, person, physics, new_parts)
         elif kind != TURN and kind != SHIFT:
             write_limit_terms(proposed, body.person[joint], physics, new_parts)
+        # Penetration only decreases the density, so joint limits, which reject more often, may
+        # suffice to reject.
+        if not log_prior(new_parts, physics) - new_parts[0] >= lower_bound:
+            continue
+        new_parts[1] = log_penetration(proposed, physics)
         if not log_prior(new_parts, physics) - new_parts[0] >= lower_bound:
             continue
         pose[:], parts[:], current = proposed, new_parts, new

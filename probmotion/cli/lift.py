@@ -197,7 +197,9 @@ class Reconstruct:
         from probmotion.models.images.category import Category
         from probmotion.models.images.observation import ImageObservation
         from probmotion.reconstruction.inference import reconstruct
+        from probmotion.validation import check_count
 
+        check_count("draws", self.draws, 2)
         category = Category.load(self.category)
         observation = ImageObservation.read(
             _one_or_all(self.image),

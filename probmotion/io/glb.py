@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import json
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,12 @@ _COMPONENTS = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 _COLOUR = [0.42, 0.53, 0.68, 1.0]
 
 
-def write_glb(motion: Motion, path: str | Path, mesh: BodyMesh | None = None) -> None:
+def write_glb(
+    motion: Motion,
+    path: str | Path,
+    mesh: BodyMesh | None = None,
+    others: Sequence[Motion] = (),
+) -> None:
     """Write a motion to a GLB file, in metres and atomically.
 
     The file contains a skeleton of rigid bones, an animation with a rotation of every joint and a
@@ -48,6 +54,9 @@ def write_glb(motion: Motion, path: str | Path, mesh: BodyMesh | None = None) ->
     mesh : BodyMesh, optional
         Body in the rest pose of ``motion``, relative to its only root, with joints of ``motion``
         that move each vertex and perhaps a texture; capsules by default.
+    others : sequence of Motion
+        Further animations of the same body, with rotations, skeleton and rest offsets of
+        ``motion``.
 
     Raises
     ------
@@ -55,7 +64,7 @@ def write_glb(motion: Motion, path: str | Path, mesh: BodyMesh | None = None) ->
         If the folder is missing or not writable.
     ValueError
         If a mesh is given for a motion of several roots or without rotations of rigid bones, or an
-        array of the mesh has a wrong shape or range.
+        array of the mesh has a wrong shape or range, or another motion is not of the same body.
 
     Warns
     -----
@@ -63,6 +72,12 @@ def write_glb(motion: Motion, path: str | Path, mesh: BodyMesh | None = None) ->
         If the positions cannot be reproduced by rigid bones.
     """
     given, motion = motion, rigid_motion(motion)
+    for number, other in enumerate(others):
+        if not _same_body(motion, other):
+            raise ValueError(
+                "others must have rotations, skeleton and rest offsets of motion, got others for "
+                f"others[{number}]"
+            )
     skeleton, roots = motion.skeleton, list(motion.skeleton.roots)
     offsets = np.array(motion.rest_offsets)
     offsets[roots] = motion.positions[0, roots] * [1.0, 0.0, 1.0]
@@ -85,7 +100,7 @@ def write_glb(motion: Motion, path: str | Path, mesh: BodyMesh | None = None) ->
     bind[:, 3, :3] = -rest  # transposed: glTF stores matrices column by column
     primitive = _primitive(buffer, mesh)
     binds = buffer.add(bind.reshape(-1, 16), _FLOAT)
-    animation = _animation(buffer, motion)
+    animations = [_animation(buffer, each) for each in (motion, *others)]
     nodes: list[dict[str, Any]] = []
     for joint, name in enumerate(skeleton.joint_names):
         node = {"name": name, "translation": offsets[joint].tolist()}
@@ -101,7 +116,7 @@ def write_glb(motion: Motion, path: str | Path, mesh: BodyMesh | None = None) ->
         "meshes": [{"name": "body", "primitives": [primitive]}],
         **_materials(buffer, mesh.texture),
         "skins": [{"inverseBindMatrices": binds, "skeleton": top, "joints": list(range(top))}],
-        "animations": [animation],
+        "animations": animations,
         "accessors": buffer.accessors,
         "bufferViews": buffer.views,
         "buffers": [{"byteLength": len(buffer.data)}],
@@ -225,6 +240,15 @@ def _materials(buffer: _Buffer, texture: Texture | None) -> dict[str, Any]:
         "samplers": [filters],
         "images": [{"name": "body", "bufferView": view, "mimeType": "image/png"}],
     }
+
+
+def _same_body(motion: Motion, other: Motion) -> bool:
+    return (
+        other.skeleton == motion.skeleton
+        and other.rotations is not None
+        and other.rest_offsets is not None
+        and np.allclose(other.rest_offsets, np.array(motion.rest_offsets), atol=1e-6)
+    )
 
 
 def _animation(buffer: _Buffer, motion: Motion) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.special import softmax
 
 from probmotion import seeds
-from probmotion.extras import torch
+from probmotion.extras import skimage, torch  # noqa: F401  Its extra has all other libraries, too.
 from probmotion.lifting.checks import Check
 from probmotion.models.images.category import Category
 from probmotion.models.images.encoder import EncoderNetwork, encoder_input, parameters_of

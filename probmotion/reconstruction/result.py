@@ -24,7 +24,7 @@ from probmotion.validation import check_count, check_finite, check_shape
 
 __all__ = ["Reconstruction"]
 
-_SHOWN = 5  # draws on the page
+_SHOWN, _ANIMATIONS = 5, 4  # draws on the page, and in the GLB
 _SIDES, _DEPTHS = ("right", "left"), ("towards the camera", "away from the camera")
 
 
@@ -169,17 +169,22 @@ class Reconstruction:
     def save(self, folder: str | Path) -> None:
         """Write the page, the surface as GLB, all draws, and a summary.
 
-        The files are ``reconstruct.html``, ``body.glb`` (body of the mode, with a texture,
-        moved by the draw whose joints are closest to those of the mode), ``reconstruction.npz``
-        (this motion, θ of the mode and the draws, and the draws' joints), and ``summary.json``.
+        The files are ``reconstruct.html``, ``body.glb`` (body of the mode, with a texture, and one
+        animation for each of the draws whose joints are closest to those of the mode),
+        ``reconstruction.npz`` (the closest one's motion, θ of the mode and the draws, and the
+        draws' joints), and ``summary.json``.
         """
         folder = Path(folder)
         writable_folder(folder)
         self.report(folder / "reconstruct.html")
-        theta = self._moving()
-        motion = replace(rig_motion(self.prior, theta), name=self.prior.category.name)
-        mesh = textured(skinned_mesh(self.prior, theta), self.observation, self.prior, self.theta)
-        write_glb(motion, folder / "body.glb", mesh)
+        moving, name = self._moving(), self.prior.category.name
+        motion, *others = (
+            replace(rig_motion(self.prior, theta), name=f"{name} {number}")
+            for number, theta in enumerate(moving)
+        )
+        mesh = skinned_mesh(self.prior, moving[0])
+        mesh = textured(mesh, self.observation, self.prior, self.theta)
+        write_glb(motion, folder / "body.glb", mesh, others)
         arrays = {"theta": self.theta, "draws": self.draws, "joints": self.joints}
         write_npz(motion, folder / "reconstruction.npz", arrays)
         content = {
@@ -200,14 +205,15 @@ class Reconstruction:
             unfinished.write_text(json.dumps(content, indent=1), encoding="utf-8")
 
     def _moving(self) -> np.ndarray:
-        """Return θ of the mode with the motion and pose of the draw closest in the first image.
+        """Return θ (n, dim) of the mode with motions and poses of the draws closest at first.
 
         Frames after the images are uncertain, and the mode moves less than any draw.
         """
         gaps = np.linalg.norm(self.joints - self.prior.motion(self.theta)[0], axis=-1).mean(axis=1)
-        theta, nearest = np.array(self.theta), self.draws[gaps.argmin()]
+        nearest = self.draws[np.argsort(gaps, kind="stable")[:_ANIMATIONS]]
+        theta = np.tile(self.theta, (len(nearest), 1))
         for part in (self.prior.layout.code, self.prior.layout.view):
-            theta[part] = nearest[part]
+            theta[:, part] = nearest[:, part]
         return theta
 
     def _left_open(self) -> str:

@@ -101,7 +101,7 @@ def test_unknown_categories_are_refused(asked, files, capsys):
 
 def test_features_that_the_category_does_not_have_are_refused(asked, files, capsys):
     words = ["image0.png", "--mask", "mask0.png", "--features", "features0.npz"]
-    message = "category quadruped must have image features of 3 channels, got none; leave"
+    message = "features must be left out for the category quadruped, got 3 channels; train"
     check_failure(files, message, *run(files, capsys, *words))
     assert asked == []
 

@@ -22,8 +22,8 @@ from probmotion.reconstruction.moving_surface import rig_motion, skinned_mesh, s
 FLIP = np.array([1.0, -1.0, -1.0])  # from the axes of the camera to those of motions
 
 
-def shown_vertices(path):
-    """Return the vertices of a GLB file in all frames as viewers show them, (L, N, 3)."""
+def shown_vertices(path, number=0):
+    """Return the vertices of a GLB file in all frames of an animation as shown, (L, N, 3)."""
     content = path.read_bytes()
     (size,) = struct.unpack("<I", content[12:16])
     scene, data = json.loads(content[20 : 20 + size]), content[28 + size :]
@@ -36,7 +36,7 @@ def shown_vertices(path):
         values = np.frombuffer(data, dtype, accessor["count"] * width, start)
         return values.reshape(-1, width).astype(float)
 
-    (animation,), (skin,) = scene["animations"], scene["skins"]
+    animation, (skin,) = scene["animations"][number], scene["skins"]
     frames = len(array(animation["samplers"][0]["output"]))
     local = np.tile(np.eye(4), (frames, len(scene["nodes"]), 1, 1))
     for at, node in enumerate(scene["nodes"]):
@@ -78,6 +78,15 @@ def test_the_file_shows_the_surface_of_the_prior(category, tmp_path):
     errors = np.linalg.norm(shown - vertices, axis=-1)
     assert errors.max() < 1e-5
     assert np.ptp(vertices, axis=0).max() > 0.03  # it moves
+    other, code = theta.copy(), prior.layout.code
+    other[code] = rng.normal(size=prior.category.code.dim)
+    write_glb(motion, tmp_path / "body.glb", mesh, [rig_motion(prior, other)])
+    vertices = prior.vertices(torch.as_tensor(other[None]))[0].numpy() * FLIP
+    errors = np.linalg.norm(shown_vertices(tmp_path / "body.glb", 1) - vertices, axis=-1)
+    assert errors.max() < 1e-5
+    other[prior.layout.lengths] += 1.0
+    with pytest.raises(ValueError, match=r"rest offsets of motion, got others for others\[0\]"):
+        write_glb(motion, tmp_path / "body.glb", mesh, [rig_motion(prior, other)])
     for joints, weights in zip(mesh.joints, mesh.weights, strict=True):
         assert len({*joints[weights > 0]}) == (weights > 0).sum()
     np.testing.assert_allclose(surface_frames(prior, theta[None])[0], vertices, atol=1e-12)
@@ -157,7 +166,9 @@ def test_all_files_are_saved(result, tmp_path):
     joints = motion.positions[:, : result.joints.shape[1]]
     # The mode moves as a draw that faces the same side.
     assert np.abs(joints[0] - result.joints).mean(axis=(1, 2)).argmin() >= 3
-    shown = shown_vertices(tmp_path / "body.glb")
+    # Each animation is of another draw; the first one is the motion in the other file.
+    shown, *others = (shown_vertices(tmp_path / "body.glb", number) for number in range(4))
+    assert all(np.abs(other - shown).max() > 0.01 for other in others)
     assert np.linalg.norm(shown.mean(axis=1) - joints.mean(axis=1), axis=-1).max() < 0.2
     corners = result.prior.category.surface.triangles.size
     assert shown.shape[1] == corners  # triangles have vertices of their own, for the texture

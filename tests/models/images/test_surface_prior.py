@@ -231,10 +231,14 @@ def test_features_of_others_are_refused(cases) -> None:
     values = [prior.log_likelihood(made.theta, bare) for prior in (plain, described)]
     np.testing.assert_array_equal(*values)
     MotionPosterior(described, bare)
-    with pytest.raises(ValueError, match=r"image features of 3 channels, got none; leave the"):
+    with pytest.raises(
+        ValueError, match=r"be left out for the category \w+, got 3 channels; train"
+    ):
         MotionPosterior(plain, whole)
     fewer = replace(whole, features=whole.features[..., :2])
-    with pytest.raises(ValueError, match=r"image features of 2 channels, got 3; leave the"):
+    with pytest.raises(
+        ValueError, match=r"have 3 channels for the category \w+, got 2 channels; train"
+    ):
         MotionPosterior(described, fewer)
 
 
