@@ -81,8 +81,8 @@ def test_the_file_shows_the_surface_of_the_prior(category, tmp_path):
     other, code = theta.copy(), prior.layout.code
     other[code] = rng.normal(size=prior.category.code.dim)
     write_glb(motion, tmp_path / "body.glb", mesh, [rig_motion(prior, other)])
-    vertices = prior.vertices(torch.as_tensor(other[None]))[0].numpy() * FLIP
-    errors = np.linalg.norm(shown_vertices(tmp_path / "body.glb", 1) - vertices, axis=-1)
+    moved = prior.vertices(torch.as_tensor(other[None]))[0].numpy() * FLIP
+    errors = np.linalg.norm(shown_vertices(tmp_path / "body.glb", 1) - moved, axis=-1)
     assert errors.max() < 1e-5
     other[prior.layout.lengths] += 1.0
     with pytest.raises(ValueError, match=r"rest offsets of motion, got others for others\[0\]"):
