@@ -30,7 +30,7 @@ from probmotion.models.pose_pairs.pair_densities import (
 from probmotion.models.pose_pairs.pair_moves import APPROACH, HINGE, STRETCH, moves_of, propose
 from probmotion.models.pose_pairs.pair_walk_kernels import approach, walk
 from probmotion.models.pose_pairs.pose_pairs import PosePairPrior
-from probmotion.posteriors.sampling import Interrupted
+from probmotion.posteriors.sampling import Interrupted, suited
 from probmotion.posteriors.truncation import TruncatedPosterior
 from probmotion.problems import load_problem
 from probmotion.samplers.mcmc import stored_chain, tempered_pairs
@@ -398,6 +398,8 @@ def test_unsuitable_posteriors_are_rejected(prior, likelihood):
     ):
         with pytest.raises(ValueError, match=message):
             TemperedPairs().sample(posterior, progress=False)
+        assert "tempered-pairs" not in suited(posterior)
+    assert "tempered-pairs" in suited(MotionPosterior(prior, likelihood))
     with pytest.raises(ValueError, match="initial must be None, got ndarray"):
         TemperedPairs().sample(MotionPosterior(prior, likelihood), initial=np.zeros((1, 108)))
     with pytest.raises(ValueError, match="levels must be an integer of at least 3, got 2"):
