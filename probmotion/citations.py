@@ -101,8 +101,7 @@ CITATIONS: Mapping[str, tuple[str, ...]] = {
     "tempered-pairs": (
         "Syed, Bouchard-Côté, Deligiannidis, Doucet (2022). Non-reversible parallel tempering: a "
         "scalable highly parallel MCMC scheme. JRSS B 84.",
-        "Liu (2001). Monte Carlo strategies in scientific computing. Springer. Section 9.4.3: "
-        "surrogate transitions.",
+        "Liu (2001). Monte Carlo strategies in scientific computing. Springer.",
         "Christen, Fox (2005). Markov chain Monte Carlo using an approximation. J. Comput. Graph. "
         "Stat. 14.",
     ),

@@ -142,7 +142,7 @@ def test_features_are_learnt_from_folders(start, tmp_path, fails):
     assert fails(*again).startswith(f"clips must be the same to resume {out}")
     more = write_clip(tmp_path / "more", channels=3)
     message = fails(*command(out / "category.npz", tmp_path / "next", "--clips", more))
-    assert message.startswith("category animal must have image features of 3 channels, got 2;")
+    assert message.startswith("features must have 2 channels for the category animal, got 3")
 
 
 def test_wrong_folders_give_one_error_line_and_no_files(start, tmp_path, fails):

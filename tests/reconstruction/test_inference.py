@@ -80,7 +80,8 @@ def test_two_equal_images_tell_as_much_as_one(animal, monkeypatch) -> None:
         cameras = prior.tangent, np.tile(np.eye(3), (count, 1, 1))
         (mode,) = refine(prior, ImageObservation(*repeated, None, *cameras), theta)
         precisions.append(np.diag(mode.precision)[prior.layout.lengths] - 1)
-    np.testing.assert_allclose(precisions[1], precisions[0], rtol=1e-3)
+    # One of the lengths hardly changes the image.
+    np.testing.assert_allclose(precisions[1], precisions[0], rtol=1e-3, atol=1e-9)
 
 
 def test_the_most_probable_candidates_come_first(animal) -> None:
