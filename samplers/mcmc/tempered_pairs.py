@@ -91,11 +91,7 @@ class TemperedPairs:
     @staticmethod
     def draws_from(posterior: MotionPosterior) -> bool:
         """Return whether the prior has walks for the likelihood."""
-        return (
-            type(posterior) in (MotionPosterior, TruncatedPosterior)
-            and isinstance(posterior.prior, HasWalks)
-            and posterior.prior.walks(posterior.likelihood) is not None
-        )
+        return _walks_of(posterior) is not None
 
     def sample(
         self,
@@ -123,7 +119,16 @@ class TemperedPairs:
         Interrupted
             On Ctrl-C, with the draws that all chains have finished.
         """
-        walks = self._walks(posterior)
+        require(self, posterior)
+        walks = _walks_of(posterior)
+        if walks is None:
+            raise UnsupportedPosterior(
+                self.name,
+                f"needs annotations of all joints, got {type(posterior).__name__} with "
+                f"{type(posterior.likelihood).__name__}",
+                word="annotations",
+                others=suited(posterior),
+            )
         if initial is not None:
             raise ValueError(f"initial must be None, got {type(initial).__name__}")
         check_count("draws", draws)
@@ -176,18 +181,13 @@ class TemperedPairs:
             counts={"density": sum(ladder.evaluations for ladder in ladders)},
         )
 
-    def _walks(self, posterior: MotionPosterior) -> Walks:
-        require(self, posterior)
-        walks = posterior.prior.walks(posterior.likelihood) if self.draws_from(posterior) else None  # type: ignore[attr-defined]
-        if walks is None:
-            raise UnsupportedPosterior(
-                self.name,
-                "needs annotations of all joints, got "
-                f"{type(posterior).__name__} with {type(posterior.likelihood).__name__}",
-                word="annotations",
-                others=suited(posterior),
-            )
-        return walks
+
+def _walks_of(posterior: MotionPosterior) -> Walks | None:
+    """Return the walks of the prior for the likelihood, if there are any."""
+    plain = type(posterior) in (MotionPosterior, TruncatedPosterior)
+    if not plain or not isinstance(posterior.prior, HasWalks):
+        return None
+    return posterior.prior.walks(posterior.likelihood)
 
 
 class _Ladder:
