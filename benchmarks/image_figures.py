@@ -4,7 +4,9 @@ Poses are those of held-out clips, which the category's motion code does not rep
 bodies, light and views are drawn from the category. Joints are relative to their middle, in the
 size of the truth, since images determine no size; those of ``pck_01`` are in the image.
 ``mask_iou_encoder``: the encoder's mean, without refinement. ``flagged``: share that checks of
-reconstructions flag, and ``flagged_shapes`` that of masks of no body. ``*_error``: standard errors.
+reconstructions flag, and ``flagged_shapes`` that of masks of no body. ``direction_missed``: share
+of images with fewer than one draw in twenty within 30° of the direction that the body faces.
+``*_error``: standard errors.
 
 ``*_without_colours``: masks alone; ``*_without_shapes``: bodies of the mean surface;
 ``*_one_hypothesis``: the encoder's likeliest quarter turn alone; ``*_with_features``: with made
@@ -32,7 +34,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from keypoint_transfer import View
-from made_bodies import SIZE, TANGENT, Bodies, Example, impossible_masks
+from made_bodies import SIZE, TANGENT, Bodies, Example, impossible_masks, yaws
 
 import probmotion.reconstruction.inference as inference
 from probmotion import seeds
@@ -45,6 +47,7 @@ from probmotion.reconstruction.refinement import Mode
 
 DRAWS = 200
 ABLATED = 40  # images of each ablation
+NEAR, MISSED = np.radians(30.0), 0.05  # of directions, and share of draws that face in them
 ABLATIONS = (
     "_without_colours",
     "_without_shapes",
@@ -139,13 +142,15 @@ def overlaps(prior: SurfacePrior, theta: np.ndarray, observation: ImageObservati
 class Estimate(NamedTuple):
     """Joints (T, J, 3) and vertices (T, V, 3) of a reconstruction, with axes as in examples.
 
-    ``draws`` (n, T, J, 3) are joints; ``mask_iou`` is a mean over images; ``flagged`` is the share
-    of reconstructions that a check flags.
+    ``draws`` (n, T, J, 3) are joints, and ``yaws`` (n,) directions that they face in the first
+    image; ``mask_iou`` is a mean over images; ``flagged`` is the share of reconstructions that a
+    check flags.
     """
 
     joints: np.ndarray
     vertices: np.ndarray
     draws: np.ndarray
+    yaws: np.ndarray
     mask_iou: float
     flagged: float
 
@@ -159,11 +164,12 @@ def reconstructed(
             reconstructed(bodies, image_of(observation, t), "", seed)
             for t in range(observation.images)
         ]
-        joints, vertices, draws, shares, failed = zip(*alone, strict=True)
+        joints, vertices, draws, facing, shares, failed = zip(*alone, strict=True)
         return Estimate(
             np.concatenate(joints),
             np.concatenate(vertices),
             np.concatenate(draws, axis=1),
+            facing[0],
             float(np.mean(shares)),
             float(np.mean(failed)),
         )
@@ -174,6 +180,7 @@ def reconstructed(
         prior.motion(theta)[:images],
         prior.vertices(torch.as_tensor(theta[None]))[0].numpy(),
         prior.motion(drawn)[:, :images],
+        yaws(prior, drawn),
         overlaps(prior, theta, observation),
         flagged(prior, modes, drawn, observation),
     )
@@ -210,8 +217,14 @@ def errors_of(estimate: Estimate, example: Example, length: float) -> dict[str, 
         "flagged": estimate.flagged,
         "pck_01": float(correct.mean()),
         "coverage_90": float(((centred >= low) & (centred <= high)).mean()),
+        "direction_missed": direction_missed(estimate.yaws, example.yaw),
         **joint_errors(estimate.joints, truth, length),
     }
+
+
+def direction_missed(draws: np.ndarray, truth: float) -> float:
+    """Return 1 if fewer than one direction in twenty is within 30° of the truth, else 0."""
+    return float((np.cos(draws - truth) > np.cos(NEAR)).mean() < MISSED)
 
 
 def transfers(bodies: Bodies, examples: list[Example], estimates: list[Estimate]) -> list[float]:

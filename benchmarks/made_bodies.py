@@ -27,12 +27,14 @@ PASSES = 3  # of moving a body into the middle
 class Example(NamedTuple):
     """Images (T) of a body, its joints (T, J, 3) and its surface (T, V, 3), metres.
 
-    Joints have Y up and Z towards the camera, vertices y down and z forward.
+    Joints have Y up and Z towards the camera, vertices y down and z forward. The body faces at
+    ``yaw`` in the first image, as of :func:`yaws`.
     """
 
     observation: ImageObservation
     joints: np.ndarray
     vertices: np.ndarray
+    yaw: float
 
 
 class Bodies:
@@ -132,6 +134,12 @@ def impossible_masks() -> list[np.ndarray]:
     return [shape.astype(float) for shape in shapes]
 
 
+def yaws(prior: SurfacePrior, theta: np.ndarray) -> np.ndarray:
+    """Return the directions (n,) that bodies (n, dim) face in the first image, radians."""
+    start = prior.layout.view.start
+    return np.arctan2(theta[:, start], theta[:, start + 1])
+
+
 def rotated(prior: SurfacePrior, theta: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Return θ (n, dim) of one image with rotations (n, 3, 3) from body to camera axes."""
     angles = Rotation.from_matrix(rotation @ np.diag([1.0, -1.0, -1.0])).as_euler("ZXY")
@@ -152,4 +160,4 @@ def _example(
     cameras = np.full(len(theta), TANGENT), np.tile(np.eye(3), (len(theta), 1, 1))
     vertices = prior.vertices(torch.as_tensor(theta))[:, 0].numpy()
     observation = ImageObservation(mask, rgb, features, *cameras)
-    return Example(observation, prior.motion(theta)[:, 0], vertices)
+    return Example(observation, prior.motion(theta)[:, 0], vertices, yaws(prior, theta)[0])

@@ -53,7 +53,7 @@ def script(category):
 
 def test_clips_show_the_held_out_motion_from_a_constant_direction(script):
     bodies = script.Bodies("quadruped", None, "validation", 2)
-    observation, joints, _ = bodies.clip(1)
+    observation, joints, *_ = bodies.clip(1)
     assert observation.images == FRAMES
     expected = bodies.category.body.positions(*(part[1] for part in bodies.fit[:4]))
     seen, moved = (each - each.mean(axis=1, keepdims=True) for each in (joints, expected))
@@ -105,6 +105,16 @@ def test_the_code_reproduces_its_own_motions(script, category):
     np.testing.assert_allclose(bodies.reproduced(0), motion, atol=1e-12)
     errors = dict(script.of_code(bodies, 2))
     assert errors["joint_error_share_of_length_of_code"] == pytest.approx(0, abs=1e-12)
+
+
+def test_directions_are_missed_if_few_draws_face_in_them(script):
+    behind = np.full(100, np.radians(-175.0))
+    behind[:5] = 0.1
+    assert [script.direction_missed(behind, np.radians(yaw)) for yaw in (160, 30, 90)] == [0, 0, 1]
+    assert script.direction_missed(behind[1:], np.radians(30.0)) == 1
+    bodies = script.Bodies("quadruped", None, "validation", 1)
+    _, prior, theta = bodies._posed(0, bodies.fit.turns[0, :1])
+    assert bodies.image(0).yaw == pytest.approx(script.yaws(prior, theta)[0])
 
 
 def test_people_are_those_of_recordings(script):

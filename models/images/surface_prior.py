@@ -33,6 +33,7 @@ _X, _Y, _LOG_WIDTH = (0.0, 0.11), (-0.12, 0.11), (math.log(0.58), 0.18)
 # Standard deviations of the changes from one image of a clip to the next.
 _CHANGES = (0.15, 0.04, 0.04, 0.06, 0.06, 0.03)  # of yaw, pitch, roll, x, y and log width
 _POSE_ERROR = 0.15  # of a bone's rotation that is estimated from one image, radians
+_MIRRORED_ERROR = 0.05  # of a bone's rotation in a mirrored pose
 _LIGHT, _LIGHT_SPREAD = (0.0, -0.5, -0.4), 0.35
 _AMBIENT = (0.55, 0.12)
 _SAME_AXES = 1e-9
@@ -250,12 +251,9 @@ class SurfacePrior(StandardNormalPrior):
         Motion codes become one by least squares of the poses, and bodies, colours and lights their
         mean. The view follows the estimates by at most a standard deviation per image.
         """
-        code, at = self.category.code, self.layout
-        mean = code.turns(np.zeros(code.dim))[: self.images]
-        basis = code.turns(np.eye(code.dim))[:, : self.images] - mean
-        posed = code.turns(theta[:, at.code])[:, 0] - mean
-        rows = basis.reshape(code.dim, -1) / _POSE_ERROR
-        z = np.linalg.solve(rows @ rows.T + np.eye(code.dim), rows @ posed.ravel() / _POSE_ERROR)
+        at = self.layout
+        turns = self.category.code.turns(theta[:, at.code])[None, :, 0]
+        z = self._closest_codes(turns, _POSE_ERROR)[0]
         view = theta[:, at.view.start :]
         alone = SurfacePrior(self.category, self.tangent[:1]).parameters(torch.as_tensor(theta))
         common = self.turned.swapaxes(1, 2) @ alone.rotation[:, 0].numpy() @ np.array(_FLIP)
@@ -269,6 +267,35 @@ class SurfacePrior(StandardNormalPrior):
             reached = reached + change * _CHANGES
         body = theta[:, at.lengths.start : at.view.start].mean(axis=0)
         return np.concatenate([z, body, view[0], changes.ravel()])
+
+    def mirrored(self, theta: np.ndarray) -> np.ndarray:
+        """Return θ (n, dim) of the bodies mirrored in depth, with left and right exchanged.
+
+        Seen from far away, they have the same silhouettes, but for the poses: codes are those of
+        the closest ones, by least squares.
+        """
+        code, at, rig = self.category.code, self.layout, self.category.body.rig
+        order = [rig.mirrored_order[rig.index(name)] for name in self.category.body.bones]
+        other = [self.category.body.bones.index(rig.joint_names[joint]) for joint in order]
+        mirrored = np.array(theta)
+        turns = code.turns(theta[:, at.code])[:, : self.images, other] * [1.0, -1.0, -1.0]
+        mirrored[:, at.code] = self._closest_codes(turns, _MIRRORED_ERROR)
+        view = mirrored[:, at.view]
+        view[:, 1] *= -1.0
+        view[:, 2] = -2 * _PITCH[0] / _PITCH[1] - view[:, 2]
+        for change in range(7, view.shape[1], len(_CHANGES)):
+            view[:, change : change + 2] *= -1.0  # of yaw and pitch
+        return mirrored
+
+    def _closest_codes(self, turns: np.ndarray, error: float) -> np.ndarray:
+        """Return the codes (n, K) of bone rotations (n, T, B, 3) with errors of a size, radians."""
+        code = self.category.code
+        mean = code.turns(np.zeros(code.dim))[: self.images]
+        basis = code.turns(np.eye(code.dim))[:, : self.images] - mean
+        rows = basis.reshape(code.dim, -1) / error
+        posed = (turns - mean).reshape(len(turns), -1) / error
+        z: np.ndarray = np.linalg.solve(rows @ rows.T + np.eye(code.dim), rows @ posed.T).T
+        return z
 
     def middle(self, theta: np.ndarray) -> np.ndarray:
         """Return the middle of the body in the first image, ``(n, dim) → (n, 3)``, camera axes."""

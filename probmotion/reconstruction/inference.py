@@ -31,7 +31,7 @@ __all__ = [
 DRAWN = 1000
 """Number of draws from the encoder of an image, of which the best are refined."""
 
-_STARTS, _KEPT = 12, 4  # draws that are refined, and modes that are refined to the end
+_STARTS, _KEPT = 12, 6  # draws that are refined, and modes that are refined to the end
 # Clips: number of random motions, correlation of half of them with the encoder's code, the best of
 # them that are refined, and modes that are refined to the end.
 _MOTIONS, _CERTAIN, _STARTS_CLIPS, _KEPT_CLIPS = 400, 0.7, 5, 2

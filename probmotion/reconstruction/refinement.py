@@ -29,6 +29,7 @@ _LONGEST = 4.0  # longest step of θ
 _SMALLEST_GAIN = 0.1  # of log density; below, a stage ends
 _FIXED = 100.0  # precision of what has no meaning
 _SAME = 0.1  # squared distance of two modes per coordinate below which they are the same
+_MIRRORED = 4  # points of the first stage whose mirror images in depth are starts, too
 _ROWS = 48  # number of θ rendered at once
 _BELIEVED = 0.02
 """Share of the information of an image in the spread of draws: their errors are larger than the
@@ -70,8 +71,10 @@ def refine(
 ) -> list[Mode]:
     """Return the modes that Gauss-Newton steps find from the starts (n, dim), best first.
 
-    Likelihoods become sharper from stage to stage. With ``keep``, only so many points go on after
-    the first stage: the best of each quarter turn, then the second best of each.
+    Likelihoods become sharper from stage to stage. With ``keep``, the best points of the first
+    stage are mirrored in depth and refined again, since silhouettes hardly show whether a body
+    faces towards the camera or away from it, and only so many points go on: the best of each
+    direction, then the second best of each.
     """
     points = [torch.as_tensor(start, dtype=torch.float32) for start in starts]
     modes: list[Mode] = []
@@ -83,6 +86,10 @@ def refine(
         reached = [_ascend(prior, likelihood, point, steps) for point in points]
         reached.sort(key=lambda point: -point[1])
         if number == 0 and keep is not None:
+            best = [point.numpy() for point, _ in _diverse(prior, reached)[:_MIRRORED]]
+            mirrored = torch.as_tensor(prior.mirrored(np.stack(best)), dtype=torch.float32)
+            reached += [_ascend(prior, likelihood, point, steps) for point in mirrored]
+            reached.sort(key=lambda point: -point[1])
             reached = _diverse(prior, reached)[:keep]
         points = [point for point, _ in reached]
     start = prior.layout.view.start
@@ -142,9 +149,14 @@ def _distinct(modes: list[Mode]) -> list[Mode]:
 def _diverse(
     prior: SurfacePrior, reached: list[tuple[torch.Tensor, float]]
 ) -> list[tuple[torch.Tensor, float]]:
-    """Return sorted points with the best of each quarter turn first, then the second of each."""
-    quarters = quarters_of(prior, np.stack([point.numpy() for point, _ in reached]))
-    ranks = [int((quarters[:k] == quarter).sum()) for k, quarter in enumerate(quarters)]
+    """Return sorted points with the best of each direction first, then the second of each.
+
+    Directions are quarter turns; those to the sides are divided into towards and away.
+    """
+    theta = np.stack([point.numpy() for point, _ in reached])
+    towards = theta[:, prior.layout.view.start + 1] > 0
+    directions = 2 * quarters_of(prior, theta) + towards
+    ranks = [int((directions[:k] == direction).sum()) for k, direction in enumerate(directions)]
     return [reached[k] for k in np.argsort(ranks, kind="stable")]
 
 

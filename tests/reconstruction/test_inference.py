@@ -63,6 +63,24 @@ def test_refinement_finds_the_pose_again(animal) -> None:
     assert radial @ np.linalg.solve(mode.precision, radial) < 0.02
 
 
+def test_refinement_finds_the_direction_that_mirrors_the_start(animal) -> None:
+    """A silhouette from the side hardly shows whether a body faces towards the camera or away."""
+    _, prior, images = animal
+    truth = prior.facing(images.theta[:1], 2.0)  # away from the camera, to the right
+    made = make_images(prior, np.random.default_rng(4), 1, SIZE, truth)
+    observation = replace(observed(made, 0), rgb=None)
+    start = prior.mirrored(made.theta)
+    sine, cosine = prior.layout.view.start, prior.layout.view.start + 1
+    assert start[0, sine] > 0
+    assert start[0, cosine] > 0
+    (alone,) = refine(prior, observation, start)
+    assert alone.theta[cosine] > 0
+    modes = refine(prior, observation, start, keep=2)
+    assert modes[0].theta[sine] > 0
+    assert modes[0].theta[cosine] < 0
+    assert modes[0].log_density > alone.log_density
+
+
 def test_two_equal_images_tell_as_much_as_one(animal, monkeypatch) -> None:
     """A body that stands still: the information of T images is that of one."""
     category, _, images = animal

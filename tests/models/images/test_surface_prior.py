@@ -16,6 +16,7 @@ from probmotion.models.images.made_images import make_images, with_made_features
 from probmotion.models.images.observation import ImageObservation
 from probmotion.models.images.posing import shaded
 from probmotion.models.images.surface_prior import SurfacePrior
+from probmotion.models.latent.turn_code import TurnCode
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.reconstruction.moving_surface import surface_frames
 from tests.models.images.meshes import icosphere
@@ -360,6 +361,24 @@ def test_a_clip_follows_estimates_of_its_images(category) -> None:
     np.testing.assert_allclose(0.06 * x.sum(), 0.09)
     kept = followed[clip.layout.code] @ theta[clip.layout.code]
     assert 0.5 < kept / (theta[clip.layout.code] ** 2).sum() < 1
+
+
+def test_bodies_mirrored_in_depth(category) -> None:
+    """From far away, all joints are where their counterparts were, at the opposite depth."""
+    bones = len(category.body.bones)
+    # A code that has all poses of two images.
+    basis = 2.0 * np.eye(6 * bones).reshape(-1, 2, bones, 3)
+    code = TurnCode(category.code.mean[:2], basis, 10.0)
+    far = SurfacePrior(replace(category, code=code), np.array([1e-4, 1e-4]))
+    theta = far.initial(np.random.default_rng(6), 3)
+    theta[:, far.layout.code] *= 0.1
+    before, after = (
+        (joints - joints.mean(axis=2, keepdims=True))[:, :2]
+        for joints in (far.motion(theta), far.motion(far.mirrored(theta)))
+    )
+    order = list(category.body.skeleton.mirrored_order)
+    np.testing.assert_allclose(after, before[:, :, order] * [1.0, 1.0, -1.0], atol=2e-3)
+    assert np.abs(after - before[:, :, order]).max() > 0.5
 
 
 def test_light_from_one_side(prior) -> None:
