@@ -4,7 +4,8 @@ Poses are those of held-out clips, which the category's motion code does not rep
 bodies, light and views are drawn from the category. Joints are relative to their middle, in the
 size of the truth, since images determine no size; those of ``pck_01`` are in the image.
 ``mask_iou_encoder``: the encoder's mean, without refinement. ``flagged``: share that checks of
-reconstructions flag, and ``flagged_shapes`` that of masks of no body. ``direction_missed``: share
+reconstructions flag, ``flagged_shapes`` that of masks of no body, and ``flagged_second`` that of
+images with a smaller second body, refused ones included. ``direction_missed``: share
 of images with fewer than one draw in twenty within 30° of the direction that the body faces.
 ``*_error``: standard errors.
 
@@ -34,7 +35,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from keypoint_transfer import View
-from made_bodies import SIZE, TANGENT, Bodies, Example, impossible_masks, yaws
+from made_bodies import SIZE, TANGENT, Bodies, Example, impossible_masks, with_second, yaws
 
 import probmotion.reconstruction.inference as inference
 from probmotion import seeds
@@ -47,6 +48,7 @@ from probmotion.reconstruction.refinement import Mode
 
 DRAWS = 200
 ABLATED = 40  # images of each ablation
+TWO = 20  # images with two bodies
 NEAR, MISSED = np.radians(30.0), 0.05  # of directions, and share of draws that face in them
 ABLATIONS = (
     "_without_colours",
@@ -205,6 +207,19 @@ def of_shapes(bodies: Bodies) -> Figures:
     yield from means(rows, "_shapes")
 
 
+def of_two_bodies(bodies: Bodies, n: int) -> Figures:
+    """Yield the share of ``n`` images with a smaller second body that are refused or flagged."""
+    rows = []
+    for number in range(n):
+        first, second = bodies.image(number), bodies.image((number + 1) % n)
+        try:
+            both = with_second(first.observation, second.observation)
+            rows.append({"flagged": reconstructed(bodies, both, "", number).flagged})
+        except ValueError:
+            rows.append({"flagged": 1.0})
+    yield from means(rows, "_second")
+
+
 def errors_of(estimate: Estimate, example: Example, length: float) -> dict[str, float]:
     """Return the figures of one reconstruction."""
     truth = example.joints
@@ -305,7 +320,12 @@ def image_figures(
     def of_clips(suffix: str = "") -> Figures:
         return measured(bodies, map(bodies.clip, range(clips)), suffix)
 
-    single = [of_encoder(bodies, images), of_shapes(bodies), of_images(images)]
+    single = [
+        of_encoder(bodies, images),
+        of_shapes(bodies),
+        of_two_bodies(bodies, min(images, TWO)),
+        of_images(images),
+    ]
     parts = {"": single, "clip_": []}
     if ablations:
         parts[""] += [of_images(min(images, ABLATED), suffix) for suffix in ABLATIONS]

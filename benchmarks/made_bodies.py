@@ -22,6 +22,7 @@ from probmotion.models.latent.turn_code import TurnCode
 
 SIZE, TANGENT = 128, 0.15
 PASSES = 3  # of moving a body into the middle
+SMALLER, OVERLAP = 0.45, 4  # size of a second body, and pixels by which it overlaps with the first
 
 
 class Example(NamedTuple):
@@ -132,6 +133,39 @@ def impossible_masks() -> list[np.ndarray]:
         (radius > 0.6) & (radius < 1) & (x < 0.3),
     ]
     return [shape.astype(float) for shape in shapes]
+
+
+def with_second(first: ImageObservation, second: ImageObservation) -> ImageObservation:
+    """Return an image of a body with a smaller one to its right.
+
+    It has about a fifth of the area and stands as low in the image. Raises ``ValueError`` if the
+    mask is refused.
+    """
+    side = 3 * SIZE
+    mask, rgb = np.zeros((side, side)), np.full((side, side, 3), 0.5)
+    corner = np.array([SIZE, SIZE])  # row and column of the first body's crop
+    smaller = (np.arange(round(SMALLER * SIZE)) / SMALLER).astype(int)
+    low, right = corner + last_pixel(first)
+    other = np.array([low, right - OVERLAP]) - SMALLER * np.array(
+        [last_pixel(second)[0], np.flatnonzero((second.mask[0] >= 0.5).any(axis=0))[0]]
+    )
+    for seen, (top, left), pixels in (
+        (second, other.astype(int), smaller),
+        (first, corner, np.arange(SIZE)),
+    ):
+        place = (slice(top, top + len(pixels)), slice(left, left + len(pixels)))
+        part = np.nan_to_num(seen.mask[0][np.ix_(pixels, pixels)])
+        covered = part >= 0.5
+        mask[place] = np.maximum(mask[place], part)
+        rgb[place][covered] = seen.rgb[0][np.ix_(pixels, pixels)][covered]
+    fov = np.degrees(2 * np.arctan(3 * TANGENT))
+    return ImageObservation.read(rgb, mask, fov=float(fov))
+
+
+def last_pixel(observation: ImageObservation) -> np.ndarray:
+    """Return the last row and column of the body in an image."""
+    body = observation.mask[0] >= 0.5
+    return np.array([np.flatnonzero(body.any(axis=axis))[-1] for axis in (1, 0)])
 
 
 def yaws(prior: SurfacePrior, theta: np.ndarray) -> np.ndarray:

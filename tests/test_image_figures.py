@@ -117,6 +117,26 @@ def test_directions_are_missed_if_few_draws_face_in_them(script):
     assert bodies.image(0).yaw == pytest.approx(script.yaws(prior, theta)[0])
 
 
+def test_a_second_body_is_smaller_and_beside_the_first(script, monkeypatch):
+    made = importlib.import_module("made_bodies")
+
+    def box(rows, columns, grey):
+        mask = np.zeros((1, 64, 64))
+        mask[0, rows, columns] = 1
+        rgb = np.full((1, 64, 64, 3), grey)
+        return made.ImageObservation(mask, rgb, None, np.array([0.15]), np.eye(3)[None])
+
+    first = box(slice(10, 50), slice(15, 45), 0.2)
+    second = box(slice(4, 44), slice(20, 60), 0.8)  # 18 pixels wide and high, beside the first
+    monkeypatch.setattr(made.ImageObservation, "read", lambda *args, fov: (*args, fov))
+    rgb, mask, fov = made.with_second(first, second)
+    assert np.tan(np.radians(fov / 2)) == pytest.approx(3 * 0.15)
+    np.testing.assert_array_equal(mask[64:128, 64:109], first.mask[0][:, :45])
+    other = np.argwhere((mask >= 0.5) & (rgb[..., 0] == 0.8))
+    np.testing.assert_allclose(other.min(axis=0), [114 - 18, 109], atol=1)
+    np.testing.assert_allclose(other.max(axis=0), [113, 109 + 18 - made.OVERLAP - 1], atol=1)
+
+
 def test_people_are_those_of_recordings(script):
     with pytest.raises(ValueError, match="data must be the folder with the real motions"):
         script.Bodies("person", None, "validation", 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy import ndimage
 from scipy.special import softmax
 
 from probmotion import seeds
@@ -36,12 +37,13 @@ _STARTS, _KEPT = 12, 6  # draws that are refined, and modes that are refined to 
 # them that are refined, and modes that are refined to the end.
 _MOTIONS, _CERTAIN, _STARTS_CLIPS, _KEPT_CLIPS = 400, 0.7, 5, 2
 _UNLIKELY = 0.02  # probability of a quarter turn below which it is not refined
-_UNCOVERED, _UNUSUAL = 0.1, 2.0
+_UNCOVERED, _UNUSUAL, _LEFT_OVER = 0.1, 2.0, 0.07
 """Largest values of reconstructions that can be trusted.
 
-They are of 1 − IoU relative to the outline (:func:`_uncovered`), and of the mean square of the
-standardised coefficients of the shape. Chosen on made images of validation clips, on discs,
-polygons and letters, and on masks of the other category.
+They are of 1 − IoU relative to the outline (:func:`_uncovered`), of the mean square of the
+standardised coefficients of the shape, and of the uncovered disc (:func:`_left_over`). Chosen on
+made images of validation clips, alone and with a second body beside the first, on discs, polygons
+and letters, and on masks of the other category.
 """
 
 
@@ -86,7 +88,7 @@ def reconstruct(
 
 
 def checked(result: Reconstruction) -> Reconstruction:
-    """Return a reconstruction with the checks of its field of view, silhouette and shape."""
+    """Return a reconstruction with checks of its field of view, silhouette, shape and mask."""
     category, shape = result.prior.category, result.theta[result.prior.layout.shape]
     return result.with_checks(
         Check(
@@ -107,6 +109,12 @@ def checked(result: Reconstruction) -> Reconstruction:
             _UNUSUAL,
             f"the surface is unlike those of the category {category.name}",
         ),
+        Check(
+            "mask",
+            _left_over(result),
+            _LEFT_OVER,
+            "the body leaves a part of the mask uncovered, which may be another animal or object",
+        ),
     )
 
 
@@ -121,6 +129,17 @@ def _uncovered(result: Reconstruction) -> float:
     outline = sum(np.nansum(np.abs(np.diff(body, axis=axis))) for axis in (1, 2))
     square = 4 * np.sqrt(np.nansum(body) * len(body))  # of the mean area, in all T images
     return float((1 - result.mask_iou) * square / max(outline, 1.0))
+
+
+def _left_over(result: Reconstruction) -> float:
+    """Return the radius of the largest disc of the mask that the silhouette leaves uncovered.
+
+    It is relative to the root of the mask's area, and the largest of all images.
+    """
+    inside = result.observation.mask >= 0.5
+    uncovered = np.pad(inside & ~result.silhouette, ((0, 0), (1, 1), (1, 1)))
+    radii = [ndimage.distance_transform_edt(image).max() for image in uncovered]
+    return float((radii / np.sqrt(inside.sum(axis=(1, 2)))).max())
 
 
 @one_thread()

@@ -83,14 +83,21 @@ class Reconstruction:
         return sd
 
     @cached_property
-    def mask_iou(self) -> float:
-        """Intersection over union of the mode's silhouette and the mask, over known pixels."""
+    def silhouette(self) -> np.ndarray:
+        """Pixels of each image that the most probable body covers, (T, S, S), bool."""
         with torch.no_grad():
             rows = torch.as_tensor(self.theta[None], dtype=torch.float32)
-            covered = self.prior.render(rows, self.observation.size)[0, ..., 3].numpy() >= 0.5
+            images = self.prior.render(rows, self.observation.size)[0]
+        covered: np.ndarray = images[..., 3].numpy() >= 0.5
+        return covered
+
+    @property
+    def mask_iou(self) -> float:
+        """Intersection over union of the mode's silhouette and the mask, over known pixels."""
         mask = self.observation.mask
         inside, known = mask >= 0.5, np.isfinite(mask)
-        return float((covered & inside).sum() / ((covered | inside) & known).sum())
+        both, either = self.silhouette & inside, (self.silhouette | inside) & known
+        return float(both.sum() / either.sum())
 
     @property
     def facing(self) -> np.ndarray:

@@ -10,6 +10,7 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("numba")
 import torch
+from scipy import ndimage
 
 from probmotion.models.images.category import Category
 from probmotion.models.images.encoder import Estimates
@@ -20,7 +21,7 @@ from probmotion.models.images.observation import ImageObservation
 from probmotion.models.images.surface_prior import SurfacePrior
 from probmotion.models.latent.turn_code import TurnCode
 from probmotion.reconstruction import Reconstruction, inference, reconstruct, refinement
-from probmotion.reconstruction.inference import _uncovered, encoded
+from probmotion.reconstruction.inference import _LEFT_OVER, _left_over, _uncovered, encoded
 from probmotion.reconstruction.refinement import Mode, promising, refine
 
 SIZE, TANGENT = 64, np.array([0.15])
@@ -229,7 +230,7 @@ def test_a_silhouette_of_something_else_is_not_trusted(animal, power) -> None:
     other = ImageObservation(mask[None], None, None, TANGENT, np.eye(3)[None])
     result = reconstruct(other, category, draws=2)
     failed = {check.name for check in result.checks if not check.passed}
-    assert failed == {"silhouette", "shape"}
+    assert {"silhouette", "shape"} <= failed
     assert "no body" in result.summary()[0]
     assert "surface" in result.summary()[0]
 
@@ -259,6 +260,29 @@ def test_errors_of_silhouettes_are_relative_to_the_outline(
     result = Reconstruction(observation, prior, theta, np.stack([theta, theta]), ())
     expected = (1 - result.mask_iou) * 4 * np.sqrt(area) / outline
     assert _uncovered(result) == pytest.approx(expected)
+
+
+def test_a_second_body_in_the_mask_is_left_over(animal) -> None:
+    """The check is the radius of the largest disc of the mask beside the silhouette."""
+    _, prior, images = animal
+    theta = images.theta[0]
+    own = observed(images, 0)
+    body = Reconstruction(own, prior, theta, np.stack([theta, theta]), ()).silhouette[0]
+    y, x = np.mgrid[:SIZE, :SIZE]
+    radius = 4.0
+    disc = (x - 6) ** 2 + (y - 6) ** 2 < radius**2
+    assert not (disc & body).any()
+
+    def left_over(mask: np.ndarray) -> float:
+        observation = replace(own, mask=mask[None].astype(float), rgb=None)
+        return _left_over(Reconstruction(observation, prior, theta, np.stack([theta, theta]), ()))
+
+    assert left_over(body) == 0
+    expected = radius / np.sqrt((body | disc).sum())
+    assert left_over(body | disc) == pytest.approx(expected, rel=0.1)
+    assert left_over(body | disc) > _LEFT_OVER
+    # A band one pixel wide along the outline is an error of the mask.
+    assert left_over(ndimage.binary_dilation(body)) < _LEFT_OVER
 
 
 @pytest.mark.slow
