@@ -37,7 +37,7 @@ _STARTS, _KEPT = 12, 6  # draws that are refined, and modes that are refined to 
 # them that are refined, and modes that are refined to the end.
 _MOTIONS, _CERTAIN, _STARTS_CLIPS, _KEPT_CLIPS = 400, 0.7, 5, 2
 _UNLIKELY = 0.02  # probability of a quarter turn below which it is not refined
-_UNCOVERED, _UNUSUAL, _LEFT_OVER = 0.1, 2.0, 0.07
+_UNCOVERED, _UNUSUAL, _LEFT_OVER = 0.1, 2.0, 0.08
 """Largest values of reconstructions that can be trusted.
 
 They are of 1 − IoU relative to the outline (:func:`_uncovered`), of the mean square of the
