@@ -230,7 +230,7 @@ class TrainImages:
             network = self._start_encoder(start, settings)
             learn_category(start, network, images, self.out, rounds=self.rounds)
         category = Category.load(self.out / CATEGORY)
-        print(f"{self.out / CATEGORY}: {self.rounds} rounds of {len(images)} images")
+        print(f"{self.out / CATEGORY}: images: {len(images)}, rounds: {self.rounds}")
         trainee = EncoderTrainee(category, settings.seed)
         run_training(trainee, settings, self.out, self.training.device)
 

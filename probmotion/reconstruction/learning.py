@@ -52,7 +52,8 @@ def learn_category(
     images : sequence of ImageObservation
         Observations of one image each, all of them with features or none.
     out : str or Path
-        Folder for ``category.npz``, written after each round; created if missing.
+        Folder for ``category.npz``, written after each round; created if missing. The category has
+        its name.
     rounds : int
         Number of rounds in all.
     progress : bool
@@ -87,7 +88,8 @@ def learn_category(
                     f"stopped in round {number} of {rounds}; finished rounds are saved in "
                     f"{folder}; run the same command to resume"
                 ) from error
-            replace(learnt, card=record | {"rounds": number}).save(folder / CATEGORY)
+            named = replace(learnt, name=folder.resolve().name, card=record | {"rounds": number})
+            named.save(folder / CATEGORY)
             learnt = Category.load(folder / CATEGORY)
     return learnt
 

@@ -70,8 +70,9 @@ def test_interrupted_runs_resume_to_the_same_category(start, tmp_path, monkeypat
     assert main(command(start, whole)) == 0
     printed = capsys.readouterr().out.splitlines()
     assert printed[0].startswith(f"{start} has no encoder beside its file: trained first, in ")
-    assert printed[-2:][0] == f"{whole / 'category.npz'}: 2 rounds of 3 images"
+    assert printed[-2:][0] == f"{whole / 'category.npz'}: images: 3, rounds: 2"
     learnt = Category.load(whole / "category.npz")
+    assert learnt.name == "whole"
     assert learnt.digest != Category.load(start).digest
     assert encoder_of(learnt).dim > 0
     learn, calls = learning.learn_surface, []
@@ -115,7 +116,7 @@ def test_clips_are_read_from_folders(start, tmp_path, capsys):
     out = tmp_path / "run"
     clips = [write_clip(tmp_path / "one", ("a", "b", "c")), write_clip(tmp_path / "two")]
     assert main(command(start, out, "--rounds", 1, "--images", 4, "--clips", *clips)) == 0
-    assert f"{out / 'category.npz'}: 1 rounds of 4 images" in capsys.readouterr().out
+    assert f"{out / 'category.npz'}: images: 4, rounds: 1" in capsys.readouterr().out
 
 
 def test_features_are_learnt_from_folders(start, tmp_path, fails):
@@ -142,7 +143,7 @@ def test_features_are_learnt_from_folders(start, tmp_path, fails):
     assert fails(*again).startswith(f"clips must be the same to resume {out}")
     more = write_clip(tmp_path / "more", channels=3)
     message = fails(*command(out / "category.npz", tmp_path / "next", "--clips", more))
-    assert message.startswith("features must have 2 channels for the category animal, got 3")
+    assert message.startswith("features must have 2 channels for the category run, got 3")
 
 
 def test_wrong_folders_give_one_error_line_and_no_files(start, tmp_path, fails):
