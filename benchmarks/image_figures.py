@@ -10,9 +10,9 @@ of images with fewer than one draw in twenty within 30° of the direction that t
 ``*_error``: standard errors.
 
 ``*_without_colours``: masks alone; ``*_without_shapes``: bodies of the mean surface;
-``*_one_hypothesis``: the encoder's likeliest quarter turn alone; ``*_with_features``: with made
-features of the surface; ``*_without_motion_prior``: bone rotations that are independent of one
-another, with the spreads of the motion code.
+``*_one_hypothesis``: starts in the encoder's likeliest quarter turn, and their mirror images;
+``*_with_features``: with made features of the surface; ``*_without_motion_prior``: bone rotations
+that are independent of one another, with the spreads of the motion code.
 
 ``transfer_pck_01``: keypoints of an image that the reconstructed surface transfers to another image
 of another body, within a tenth of its size (*Ponymation*, section 4.2.2).
@@ -35,7 +35,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from keypoint_transfer import View
-from made_bodies import SIZE, TANGENT, Bodies, Example, impossible_masks, with_second, yaws
+from made_bodies import SIZE, TANGENT, Bodies, Example, impossible_masks, with_second
 
 import probmotion.reconstruction.inference as inference
 from probmotion import seeds
@@ -48,8 +48,9 @@ from probmotion.reconstruction.refinement import Mode
 
 DRAWS = 200
 ABLATED = 40  # images of each ablation
-TWO = 20  # images with two bodies
-NEAR, MISSED = np.radians(30.0), 0.05  # of directions, and share of draws that face in them
+TWO = 27  # bodies of whose images those with two are made
+# Angle from the true direction, and share of draws within it below which the direction is missed.
+NEAR, MISSED = np.radians(30.0), 0.05
 ABLATIONS = (
     "_without_colours",
     "_without_shapes",
@@ -182,7 +183,7 @@ def reconstructed(
         prior.motion(theta)[:images],
         prior.vertices(torch.as_tensor(theta[None]))[0].numpy(),
         prior.motion(drawn)[:, :images],
-        yaws(prior, drawn),
+        prior.yaw(drawn),
         overlaps(prior, theta, observation),
         flagged(prior, modes, drawn, observation),
     )
@@ -208,15 +209,20 @@ def of_shapes(bodies: Bodies) -> Figures:
 
 
 def of_two_bodies(bodies: Bodies, n: int) -> Figures:
-    """Yield the share of ``n`` images with a smaller second body that are refused or flagged."""
+    """Yield the share of images with a smaller second body that are refused or flagged.
+
+    They are of those of the first ``n`` bodies that are not cut off.
+    """
+    alone = [bodies.image(number).observation for number in range(n)]
+    alone = [observation for observation in alone if not observation.truncated.any()]
     rows = []
-    for number in range(n):
-        first, second = bodies.image(number), bodies.image((number + 1) % n)
+    for number, (first, second) in enumerate(zip(alone, alone[1:] + alone[:1], strict=True)):
         try:
-            both = with_second(first.observation, second.observation)
-            rows.append({"flagged": reconstructed(bodies, both, "", number).flagged})
+            both = with_second(first, second)
         except ValueError:
             rows.append({"flagged": 1.0})
+            continue
+        rows.append({"flagged": reconstructed(bodies, both, "", number).flagged})
     yield from means(rows, "_second")
 
 

@@ -29,7 +29,7 @@ class Example(NamedTuple):
     """Images (T) of a body, its joints (T, J, 3) and its surface (T, V, 3), metres.
 
     Joints have Y up and Z towards the camera, vertices y down and z forward. The body faces at
-    ``yaw`` in the first image, as of :func:`yaws`.
+    ``yaw`` in the first image, as of ``SurfacePrior.yaw``.
     """
 
     observation: ImageObservation
@@ -168,12 +168,6 @@ def last_pixel(observation: ImageObservation) -> np.ndarray:
     return np.array([np.flatnonzero(body.any(axis=axis))[-1] for axis in (1, 0)])
 
 
-def yaws(prior: SurfacePrior, theta: np.ndarray) -> np.ndarray:
-    """Return the directions (n,) that bodies (n, dim) face in the first image, radians."""
-    start = prior.layout.view.start
-    return np.arctan2(theta[:, start], theta[:, start + 1])
-
-
 def rotated(prior: SurfacePrior, theta: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Return θ (n, dim) of one image with rotations (n, 3, 3) from body to camera axes."""
     angles = Rotation.from_matrix(rotation @ np.diag([1.0, -1.0, -1.0])).as_euler("ZXY")
@@ -194,4 +188,4 @@ def _example(
     cameras = np.full(len(theta), TANGENT), np.tile(np.eye(3), (len(theta), 1, 1))
     vertices = prior.vertices(torch.as_tensor(theta))[:, 0].numpy()
     observation = ImageObservation(mask, rgb, features, *cameras)
-    return Example(observation, prior.motion(theta)[:, 0], vertices, yaws(prior, theta)[0])
+    return Example(observation, prior.motion(theta)[:, 0], vertices, float(prior.yaw(theta)[0]))

@@ -37,13 +37,13 @@ _STARTS, _KEPT = 12, 6  # draws that are refined, and modes that are refined to 
 # them that are refined, and modes that are refined to the end.
 _MOTIONS, _CERTAIN, _STARTS_CLIPS, _KEPT_CLIPS = 400, 0.7, 5, 2
 _UNLIKELY = 0.02  # probability of a quarter turn below which it is not refined
-_UNCOVERED, _UNUSUAL, _LEFT_OVER = 0.1, 2.0, 0.08
+_OUTLINE_ERROR, _UNUSUAL, _UNCOVERED = 0.1, 2.0, 0.08
 """Largest values of reconstructions that can be trusted.
 
-They are of 1 − IoU relative to the outline (:func:`_uncovered`), of the mean square of the
-standardised coefficients of the shape, and of the uncovered disc (:func:`_left_over`). Chosen on
-made images of validation clips, alone and with a second body beside the first, on discs, polygons
-and letters, and on masks of the other category.
+They are of 1 − IoU relative to the outline (:func:`_outline_error`), of the mean square of the
+standardised coefficients of the shape, and of the uncovered disc (:func:`_uncovered_radius`).
+Chosen on made images of validation clips, alone and with a second body beside the first, on discs,
+polygons and letters, and on masks of the other category.
 """
 
 
@@ -88,7 +88,7 @@ def reconstruct(
 
 
 def checked(result: Reconstruction) -> Reconstruction:
-    """Return a reconstruction with checks of its field of view, silhouette, shape and mask."""
+    """Return a reconstruction with its checks of field of view, silhouette, shape and mask."""
     category, shape = result.prior.category, result.theta[result.prior.layout.shape]
     return result.with_checks(
         Check(
@@ -99,8 +99,8 @@ def checked(result: Reconstruction) -> Reconstruction:
         ),
         Check(
             "silhouette",
-            _uncovered(result),
-            _UNCOVERED,
+            _outline_error(result),
+            _OUTLINE_ERROR,
             f"no body of the category {category.name} has this silhouette",
         ),
         Check(
@@ -110,15 +110,15 @@ def checked(result: Reconstruction) -> Reconstruction:
             f"the surface is unlike those of the category {category.name}",
         ),
         Check(
-            "mask",
-            _left_over(result),
-            _LEFT_OVER,
+            "uncovered part",
+            _uncovered_radius(result),
+            _UNCOVERED,
             "the body leaves a part of the mask uncovered, which may be another animal or object",
         ),
     )
 
 
-def _uncovered(result: Reconstruction) -> float:
+def _outline_error(result: Reconstruction) -> float:
     """Return 1 − IoU of silhouette and mask for an outline as short as that of a square.
 
     Silhouettes of thin bodies have a smaller IoU when outlines are equally far apart; 1 − IoU is
@@ -131,15 +131,15 @@ def _uncovered(result: Reconstruction) -> float:
     return float((1 - result.mask_iou) * square / max(outline, 1.0))
 
 
-def _left_over(result: Reconstruction) -> float:
+def _uncovered_radius(result: Reconstruction) -> float:
     """Return the radius of the largest disc of the mask that the silhouette leaves uncovered.
 
-    It is relative to the root of the mask's area, and the largest of all images.
+    It is relative to the square root of the mask's area, and the mean of all images.
     """
     inside = result.observation.mask >= 0.5
     uncovered = np.pad(inside & ~result.silhouette, ((0, 0), (1, 1), (1, 1)))
     radii = [ndimage.distance_transform_edt(image).max() for image in uncovered]
-    return float((radii / np.sqrt(inside.sum(axis=(1, 2)))).max())
+    return float((radii / np.sqrt(inside.sum(axis=(1, 2)))).mean())
 
 
 @one_thread()

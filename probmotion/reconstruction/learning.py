@@ -52,8 +52,8 @@ def learn_category(
     images : sequence of ImageObservation
         Observations of one image each, all of them with features or none.
     out : str or Path
-        Folder for ``category.npz``, written after each round; created if missing. The category has
-        its name.
+        Folder for ``category.npz``, written after each round; created if missing. The category is
+        named after it.
     rounds : int
         Number of rounds in all.
     progress : bool

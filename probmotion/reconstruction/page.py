@@ -118,8 +118,7 @@ def _images(observation: ImageObservation, prior: SurfacePrior, theta: np.ndarra
 
 def _views(prior: SurfacePrior, theta: np.ndarray) -> str:
     """Return figures of the body from around it, in the first image."""
-    start = prior.layout.view.start
-    yaw = float(np.arctan2(theta[start], theta[start + 1]))
+    yaw = float(prior.yaw(theta))
     figures = []
     for turn in range(_VIEWS):
         turned = prior.facing(theta, yaw + turn * 2 * np.pi / _VIEWS)

@@ -85,11 +85,12 @@ def refine(
         )
         reached = [_ascend(prior, likelihood, point, steps) for point in points]
         reached.sort(key=lambda point: -point[1])
-        if number == 0 and keep is not None:
+        if number == 0 and keep is not None and prior.category.body.symmetric:
             best = [point.numpy() for point, _ in _diverse(prior, reached)[:_MIRRORED]]
             mirrored = torch.as_tensor(prior.mirrored(np.stack(best)), dtype=torch.float32)
             reached += [_ascend(prior, likelihood, point, steps) for point in mirrored]
             reached.sort(key=lambda point: -point[1])
+        if number == 0 and keep is not None:
             reached = _diverse(prior, reached)[:keep]
         points = [point for point, _ in reached]
     start = prior.layout.view.start
@@ -98,7 +99,7 @@ def refine(
         # The length of the two coordinates of the direction does not matter: draws keep it, or
         # they would cross the origin and face the other way.
         pair = point[start : start + 2].double()
-        turned = prior.facing(point.numpy(), math.atan2(float(pair[0]), float(pair[1])))
+        turned = prior.facing(point.numpy(), prior.yaw(point.numpy()))
         value += 0.5 * float((pair**2).sum()) - 1.0
         point = torch.as_tensor(turned, dtype=torch.float32)
         images = _images(prior, point[None], likelihood)
@@ -131,8 +132,7 @@ def promising(
 
 def quarters_of(prior: SurfacePrior, theta: np.ndarray) -> np.ndarray:
     """Return the quarter turn of the direction in which each of n bodies (n, dim) faces."""
-    start = prior.layout.view.start
-    return quarter_of(np.arctan2(theta[:, start], theta[:, start + 1]))[0]
+    return quarter_of(prior.yaw(theta))[0]
 
 
 def _distinct(modes: list[Mode]) -> list[Mode]:
@@ -154,8 +154,7 @@ def _diverse(
     Directions are quarter turns; those to the sides are divided into towards and away.
     """
     theta = np.stack([point.numpy() for point, _ in reached])
-    towards = theta[:, prior.layout.view.start + 1] > 0
-    directions = 2 * quarters_of(prior, theta) + towards
+    directions = 2 * quarters_of(prior, theta) + (np.cos(prior.yaw(theta)) > 0)
     ranks = [int((directions[:k] == direction).sum()) for k, direction in enumerate(directions)]
     return [reached[k] for k in np.argsort(ranks, kind="stable")]
 

@@ -105,10 +105,7 @@ class Reconstruction:
 
         0 is towards the camera, 90 to the right of the image, and ±180 away.
         """
-        start = self.prior.layout.view.start
-        directions: np.ndarray = np.degrees(
-            np.arctan2(self.draws[:, start], self.draws[:, start + 1])
-        )
+        directions: np.ndarray = np.degrees(self.prior.yaw(self.draws))
         return directions
 
     @property

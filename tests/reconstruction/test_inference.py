@@ -21,7 +21,12 @@ from probmotion.models.images.observation import ImageObservation
 from probmotion.models.images.surface_prior import SurfacePrior
 from probmotion.models.latent.turn_code import TurnCode
 from probmotion.reconstruction import Reconstruction, inference, reconstruct, refinement
-from probmotion.reconstruction.inference import _LEFT_OVER, _left_over, _uncovered, encoded
+from probmotion.reconstruction.inference import (
+    _UNCOVERED,
+    _outline_error,
+    _uncovered_radius,
+    encoded,
+)
 from probmotion.reconstruction.refinement import Mode, promising, refine
 
 SIZE, TANGENT = 64, np.array([0.15])
@@ -64,7 +69,7 @@ def test_refinement_finds_the_pose_again(animal) -> None:
     assert radial @ np.linalg.solve(mode.precision, radial) < 0.02
 
 
-def test_refinement_finds_the_direction_that_mirrors_the_start(animal) -> None:
+def test_refinement_finds_the_direction_that_mirrors_the_start(animal, monkeypatch) -> None:
     """A silhouette from the side hardly shows whether a body faces towards the camera or away."""
     _, prior, images = animal
     truth = prior.facing(images.theta[:1], 2.0)  # away from the camera, to the right
@@ -80,6 +85,10 @@ def test_refinement_finds_the_direction_that_mirrors_the_start(animal) -> None:
     assert modes[0].theta[sine] > 0
     assert modes[0].theta[cosine] < 0
     assert modes[0].log_density > alone.log_density
+    # Skeletons without symmetry have no mirror images.
+    monkeypatch.setitem(vars(prior.category.body), "symmetric", False)
+    (unmirrored,) = refine(prior, observation, start, keep=2)
+    np.testing.assert_array_equal(unmirrored.theta, alone.theta)
 
 
 def test_two_equal_images_tell_as_much_as_one(animal, monkeypatch) -> None:
@@ -172,13 +181,14 @@ def test_reconstructions_use_one_thread(animal, monkeypatch, two_threads) -> Non
     assert threads == [1]
 
 
-def test_the_best_of_each_quarter_turn_goes_on_first(animal) -> None:
+def test_the_best_of_each_direction_goes_on_first(animal) -> None:
+    """Quarter turns, of which those to the sides are divided at 90°."""
     _, prior, _ = animal
-    quarters = np.array([0, 0, 0, 1, 1, 2])
-    theta = torch.as_tensor(prior.facing(np.zeros((6, prior.dim)), quarters * np.pi / 2))
+    yaw = np.radians([0, 30, -40, 80, 100, 50, 180, -91])
+    theta = torch.as_tensor(prior.facing(np.zeros((8, prior.dim)), yaw))
     reached = [(point, -float(k)) for k, point in enumerate(theta)]
-    order = [value for _, value in refinement._diverse(prior, reached)]
-    assert order == [-0.0, -3.0, -5.0, -1.0, -4.0, -2.0]
+    order = [int(-value) for _, value in refinement._diverse(prior, reached)]
+    assert order == [0, 3, 4, 6, 7, 1, 5, 2]
 
 
 @pytest.mark.parametrize(("softness", "difference"), [(1.0, 0.05), (2.0, 0.1), (8.0, 0.15)])
@@ -259,30 +269,31 @@ def test_errors_of_silhouettes_are_relative_to_the_outline(
     theta = np.concatenate([made.theta[0], np.zeros(prior.dim - single.dim)])
     result = Reconstruction(observation, prior, theta, np.stack([theta, theta]), ())
     expected = (1 - result.mask_iou) * 4 * np.sqrt(area) / outline
-    assert _uncovered(result) == pytest.approx(expected)
+    assert _outline_error(result) == pytest.approx(expected)
 
 
-def test_a_second_body_in_the_mask_is_left_over(animal) -> None:
+def test_a_second_body_in_the_mask_is_uncovered(animal) -> None:
     """The check is the radius of the largest disc of the mask beside the silhouette."""
     _, prior, images = animal
     theta = images.theta[0]
     own = observed(images, 0)
-    body = Reconstruction(own, prior, theta, np.stack([theta, theta]), ()).silhouette[0]
+    draws = np.stack([theta, theta])
+    body = Reconstruction(own, prior, theta, draws, ()).silhouette[0]
     y, x = np.mgrid[:SIZE, :SIZE]
     radius = 4.0
     disc = (x - 6) ** 2 + (y - 6) ** 2 < radius**2
     assert not (disc & body).any()
 
-    def left_over(mask: np.ndarray) -> float:
+    def radius_of(mask: np.ndarray) -> float:
         observation = replace(own, mask=mask[None].astype(float), rgb=None)
-        return _left_over(Reconstruction(observation, prior, theta, np.stack([theta, theta]), ()))
+        return _uncovered_radius(Reconstruction(observation, prior, theta, draws, ()))
 
-    assert left_over(body) == 0
+    assert radius_of(body) == 0
     expected = radius / np.sqrt((body | disc).sum())
-    assert left_over(body | disc) == pytest.approx(expected, rel=0.1)
-    assert left_over(body | disc) > _LEFT_OVER
+    assert radius_of(body | disc) == pytest.approx(expected, rel=0.1)
+    assert radius_of(body | disc) > _UNCOVERED
     # A band one pixel wide along the outline is an error of the mask.
-    assert left_over(ndimage.binary_dilation(body)) < _LEFT_OVER
+    assert radius_of(ndimage.binary_dilation(body)) < _UNCOVERED
 
 
 @pytest.mark.slow
