@@ -154,7 +154,7 @@ pd.Series(compared(result, truth)).round(2)
 # Seen from behind, an animal and its mirror image have nearly the same silhouette, and depth is seen only through
 # perspective. Another image shows what remains: below, draws given its mask alone, seen by the camera and from above, where
 # it did not look; and draws given its colours, too. The truth is in black. Here, the mask tells that the animal faces
-# away; given the colours, too, a third of the draws face slightly to the right, and the others to the left. The guide to
+# away; given the colours, too, half of the draws face slightly to the right, and the others to the left. The guide to
 # `probmotion reconstruct` has the errors of many images.
 
 # %%
