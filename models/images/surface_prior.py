@@ -265,10 +265,11 @@ class SurfacePrior(StandardNormalPrior):
         z = self._closest_codes(turns, _POSE_ERROR)[0]
         view = theta[:, at.view.start :]
         alone = SurfacePrior(self.category, self.tangent[:1]).parameters(torch.as_tensor(theta))
-        angles = _angles(self.turned.swapaxes(1, 2) @ alone.rotation[:, 0].numpy())
+        common = self.turned.swapaxes(1, 2) @ alone.rotation[:, 0].numpy() @ np.array(_FLIP)
+        roll, pitch, yaw = Rotation.from_matrix(common).as_euler("ZXY").T
         places = view[:, 4:] * (_X[1], _Y[1], _LOG_WIDTH[1])
         places[:, 2] -= np.log(self.tangent)
-        path = np.column_stack([angles, places])
+        path = np.column_stack([np.unwrap(-yaw), pitch, roll, places])
         reached, changes = path[0], np.zeros((self.images - 1, len(_CHANGES)))
         for change, estimate in zip(changes, path[1:], strict=True):
             change[:] = np.clip((estimate - reached) / _CHANGES, -1.0, 1.0)
@@ -277,7 +278,7 @@ class SurfacePrior(StandardNormalPrior):
         return np.concatenate([z, body, view[0], changes.ravel()])
 
     def mirrored(self, theta: np.ndarray) -> np.ndarray:
-        """Return θ (n, dim) of the bodies mirrored in depth, with left and right exchanged.
+        """Return θ (n, dim) of one image with bodies mirrored in depth, left and right exchanged.
 
         Seen from far away, bodies of a symmetric skeleton keep their silhouettes, but for poses
         that the code does not have: codes are those of the closest ones, by regularised least
@@ -289,14 +290,9 @@ class SurfacePrior(StandardNormalPrior):
         mirrored = np.array(theta)
         turns = code.turns(theta[:, at.code])[:, : self.images, other] * [1.0, -1.0, -1.0]
         mirrored[:, at.code] = self._closest_codes(turns, _MIRRORED_ERROR)
-        rotation = self.parameters(torch.as_tensor(theta)).rotation.numpy()
-        in_depth = self.turned.swapaxes(1, 2) @ np.diag([1.0, 1.0, -1.0]) @ self.turned
-        angles = _angles(in_depth @ rotation @ np.diag([-1.0, 1.0, 1.0]))
         view = mirrored[:, at.view]
         view[:, 1] *= -1.0
         view[:, 2] = -2 * _PITCH[0] / _PITCH[1] - view[:, 2]
-        for k, change in enumerate(np.moveaxis(np.diff(angles, axis=1), 1, 0) / _CHANGES[:3]):
-            view[:, 7 + 6 * k : 10 + 6 * k] = change
         return mirrored
 
     def _closest_codes(self, turns: np.ndarray, error: float) -> np.ndarray:
@@ -382,18 +378,6 @@ class SurfacePrior(StandardNormalPrior):
         """Return colours (B, V, 3) and the category's features, (B, V, 3 + F)."""
         features = torch.as_tensor(self.category.features, dtype=colours.dtype)
         return torch.cat([colours, features.expand(len(colours), -1, -1)], dim=-1)
-
-
-def _angles(rotation: np.ndarray) -> np.ndarray:
-    """Return yaw, pitch and roll (…, T, 3) of rotations from body to camera (…, T, 3, 3).
-
-    Yaws of successive images differ by at most a half turn.
-    """
-    flat = (rotation @ np.array(_FLIP)).reshape(-1, 3, 3)
-    roll, pitch, yaw = (
-        angle.reshape(rotation.shape[:-2]) for angle in Rotation.from_matrix(flat).as_euler("ZXY").T
-    )
-    return np.stack([np.unwrap(-yaw, axis=-1), pitch, roll], axis=-1)
 
 
 def _about(axis: int, angle: torch.Tensor) -> torch.Tensor:

@@ -71,10 +71,10 @@ def refine(
 ) -> list[Mode]:
     """Return the modes that Gauss-Newton steps find from the starts (n, dim), best first.
 
-    Likelihoods become sharper from stage to stage. With ``keep``, the best points of the first
-    stage are mirrored in depth and refined again, since silhouettes hardly show whether a body
-    faces towards the camera or away from it, and only so many points go on: the best of each
-    direction, then the second best of each.
+    Likelihoods become sharper from stage to stage. With ``keep``, only so many points go on after
+    the first stage: the best of each direction, then the second best of each. Before, the best
+    points of one image are mirrored in depth and refined again, since a silhouette hardly shows
+    whether a body faces towards the camera or away from it.
     """
     points = [torch.as_tensor(start, dtype=torch.float32) for start in starts]
     modes: list[Mode] = []
@@ -85,7 +85,8 @@ def refine(
         )
         reached = [_ascend(prior, likelihood, point, steps) for point in points]
         reached.sort(key=lambda point: -point[1])
-        if number == 0 and keep is not None and prior.category.body.symmetric:
+        alone = prior.images == 1 and prior.category.body.symmetric
+        if number == 0 and keep is not None and alone:
             best = [point.numpy() for point, _ in _diverse(prior, reached)[:_MIRRORED]]
             mirrored = torch.as_tensor(prior.mirrored(np.stack(best)), dtype=torch.float32)
             reached += [_ascend(prior, likelihood, point, steps) for point in mirrored]
@@ -99,7 +100,7 @@ def refine(
         # The length of the two coordinates of the direction does not matter: draws keep it, or
         # they would cross the origin and face the other way.
         pair = point[start : start + 2].double()
-        turned = prior.facing(point.numpy(), prior.yaw(point.numpy()))
+        turned = prior.facing(point.numpy(), prior.yaw(point.double().numpy()))
         value += 0.5 * float((pair**2).sum()) - 1.0
         point = torch.as_tensor(turned, dtype=torch.float32)
         images = _images(prior, point[None], likelihood)
@@ -151,10 +152,13 @@ def _diverse(
 ) -> list[tuple[torch.Tensor, float]]:
     """Return sorted points with the best of each direction first, then the second of each.
 
-    Directions are quarter turns; those to the sides are divided into towards and away.
+    Directions are quarter turns; of one image, those to the sides are divided into towards and
+    away.
     """
     theta = np.stack([point.numpy() for point, _ in reached])
-    directions = 2 * quarters_of(prior, theta) + (np.cos(prior.yaw(theta)) > 0)
+    directions = quarters_of(prior, theta)
+    if prior.images == 1:
+        directions = 2 * directions + (np.cos(prior.yaw(theta)) > 0)
     ranks = [int((directions[:k] == direction).sum()) for k, direction in enumerate(directions)]
     return [reached[k] for k in np.argsort(ranks, kind="stable")]
 
