@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -272,26 +273,24 @@ def test_errors_of_silhouettes_are_relative_to_the_outline(
     assert _outline_error(result) == pytest.approx(expected)
 
 
-def test_a_second_body_in_the_mask_is_uncovered(animal) -> None:
+def test_a_second_body_in_the_mask_is_uncovered() -> None:
     """The check is the radius of the largest disc of the mask beside the silhouette."""
-    _, prior, images = animal
-    theta = images.theta[0]
-    own = observed(images, 0)
-    draws = np.stack([theta, theta])
-    body = Reconstruction(own, prior, theta, draws, ()).silhouette[0]
     y, x = np.mgrid[:SIZE, :SIZE]
-    radius = 4.0
-    disc = (x - 6) ** 2 + (y - 6) ** 2 < radius**2
-    assert not (disc & body).any()
+    body, radius = np.hypot(x - 40, y - 36) < 20, 6.0
+    other = np.hypot(x - 8, y - 8) < radius
 
-    def radius_of(mask: np.ndarray) -> float:
-        observation = replace(own, mask=mask[None].astype(float), rgb=None)
-        return _uncovered_radius(Reconstruction(observation, prior, theta, draws, ()))
+    def radius_of(*masks: np.ndarray) -> float:
+        mask = np.where(y < SIZE - 2, np.stack(masks).astype(float), np.nan)
+        result = SimpleNamespace(
+            observation=SimpleNamespace(mask=mask), silhouette=np.stack([body] * len(masks))
+        )
+        return _uncovered_radius(result)
 
     assert radius_of(body) == 0
-    expected = radius / np.sqrt((body | disc).sum())
-    assert radius_of(body | disc) == pytest.approx(expected, rel=0.1)
-    assert radius_of(body | disc) > _UNCOVERED
+    alone = radius / np.sqrt((body | other).sum())
+    assert radius_of(body | other) == pytest.approx(alone, rel=0.05)
+    assert radius_of(body, body | other) == pytest.approx(alone / 2, rel=0.05)
+    assert radius_of(body | other) > _UNCOVERED
     # A band one pixel wide along the outline is an error of the mask.
     assert radius_of(ndimage.binary_dilation(body)) < _UNCOVERED
 
