@@ -100,27 +100,32 @@ class _Rasterize(torch.autograd.Function):
         n, _, channels = inputs[2].shape
         plain, nearness = np.zeros((n, size, size, channels + 1)), np.zeros((n, size, size))
         faces = np.full((n, size, size), -1, dtype=np.int64)
+        areas = _areas(inputs[0], inputs[1], triangles)
         # After Ctrl-C, compiled functions that return several arrays raise SystemError.
-        _visible(plain, faces, nearness, *inputs, triangles)
+        _visible(plain, faces, nearness, *inputs, triangles, areas)
         image = plain.copy()
-        most = _most_crossings(*inputs[:2], triangles, edges, size)
+        silhouettes = _silhouettes(areas > 0, triangles, edges)
+        lines = _lines(inputs[0], silhouettes, edges, size)
+        most = int((lines[..., 1] - lines[..., 0]).sum())
         places, values = np.empty((most, 7), dtype=np.int64), np.empty((most, 3))
-        count = _crossings(places, values, nearness, *inputs[:2], triangles, edges, tolerance)
+        count = _crossings(
+            places, values, nearness, *inputs[:2], edges, silhouettes, lines, tolerance
+        )
         crossings = places[:count], values[:count]
         _blend(image, plain, *inputs[1:], edges, *crossings)
-        context.state = (*inputs, triangles, edges, plain, faces, *crossings)
+        context.state = (*inputs, triangles, areas, edges, plain, faces, *crossings)
         context.dtype = screen.dtype
         return torch.from_numpy(image).to(screen.dtype)
 
     @staticmethod
     def backward(context: Any, *gradients: torch.Tensor) -> Any:
-        screen, inverse, colours, triangles, edges, plain, faces, *crossings = context.state
+        screen, inverse, colours, triangles, areas, edges, plain, faces, *crossings = context.state
         gradient = np.ascontiguousarray(gradients[0].detach().double().numpy())
         inputs = screen, inverse, colours
         parts = [np.zeros_like(part) for part in inputs]
         of_plain = gradient.copy()
         _blend_back(gradient, of_plain, *parts, plain, *inputs, edges, *crossings)
-        _visible_back(of_plain, *parts, *inputs, triangles, faces)
+        _visible_back(of_plain, *parts, *inputs, triangles, areas, faces)
         tensors = [torch.from_numpy(part).to(context.dtype) for part in parts]
         return (*tensors, None, None, None)
 
@@ -143,20 +148,34 @@ def _edges(triangles: np.ndarray) -> np.ndarray:
     return np.concatenate([one, sides], axis=1)
 
 
-@numba.njit(cache=True)
-def _area(screen: np.ndarray, a: int, b: int, c: int) -> float:
-    """Return twice the signed area of a triangle, positive if its outside is seen."""
+def _areas(screen: np.ndarray, inverse: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return twice the areas of triangles on the screen (B, T), 0 where the outside is not seen.
+
+    Triangles with a vertex behind the camera are not seen, either.
+    """
+    x, y = (screen[:, triangles, axis] for axis in range(2))
     # Counterclockwise from outside is clockwise in an image whose y axis points down.
-    return (screen[c, 0] - screen[a, 0]) * (screen[b, 1] - screen[a, 1]) - (
-        screen[b, 0] - screen[a, 0]
-    ) * (screen[c, 1] - screen[a, 1])
+    areas = (x[..., 2] - x[..., 0]) * (y[..., 1] - y[..., 0]) - (x[..., 1] - x[..., 0]) * (
+        y[..., 2] - y[..., 0]
+    )
+    return np.where((inverse[:, triangles] > 0).all(axis=-1) & (areas > 1e-9), areas, 0.0)
 
 
-@numba.njit(cache=True)
-def _seen(screen: np.ndarray, inverse: np.ndarray, triangle: np.ndarray) -> bool:
-    a, b, c = triangle
-    in_front = inverse[a] > 0 and inverse[b] > 0 and inverse[c] > 0
-    return in_front and _area(screen, a, b, c) > 1e-9
+def _silhouettes(seen: np.ndarray, triangles: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Return the silhouette edges (S, 3): image, edge, and third vertex of the visible triangle."""
+    one, other = seen[:, edges[:, 2]], seen[:, edges[:, 3]]
+    image, edge = np.nonzero(one != other)
+    inner = np.where(one[image, edge], edges[edge, 2], edges[edge, 3])
+    third = triangles[inner].sum(axis=1) - edges[edge, :2].sum(axis=1)
+    return np.stack([image, edge, third], axis=1)
+
+
+def _lines(screen: np.ndarray, silhouettes: np.ndarray, edges: np.ndarray, size: int) -> np.ndarray:
+    """Return the first row and column whose centres silhouettes cross, and the ends, (S, 2, 2)."""
+    ends = screen[silhouettes[:, :1], edges[silhouettes[:, 1], :2], ::-1]  # (S, 2 ends, y and x)
+    limits = np.stack([ends.min(axis=1), ends.max(axis=1)], axis=-1)
+    lines: np.ndarray = np.ceil(limits.clip(0.0, size) - 0.5).astype(np.int64)
+    return lines
 
 
 @numba.njit(cache=True)
@@ -168,15 +187,16 @@ def _visible(
     inverse: np.ndarray,
     colours: np.ndarray,
     triangles: np.ndarray,
+    areas: np.ndarray,
 ) -> None:
     """Fill images without antialiasing, the visible triangles (of −1, for none), and 1 / depth."""
     size, channels = nearness.shape[1], colours.shape[2]
     for i in range(len(screen)):
         for t in range(len(triangles)):
-            if not _seen(screen[i], inverse[i], triangles[t]):
+            area = areas[i, t]
+            if area == 0:
                 continue
             a, b, c = triangles[t]
-            area = _area(screen[i], a, b, c)
             xa, ya = screen[i, a]
             xb, yb = screen[i, b]
             xc, yc = screen[i, c]
@@ -216,6 +236,7 @@ def _visible_back(
     inverse: np.ndarray,
     colours: np.ndarray,
     triangles: np.ndarray,
+    areas: np.ndarray,
     faces: np.ndarray,
 ) -> None:
     """Add the gradients of the visible colours with respect to vertices and their colours."""
@@ -227,8 +248,7 @@ def _visible_back(
                 if t < 0:
                     continue
                 triangle = triangles[t]
-                a, b, c = triangle
-                area = _area(screen[i], a, b, c)
+                area = areas[i, t]
                 for k in range(3):
                     after, last = triangle[(k + 1) % 3], triangle[(k + 2) % 3]
                     dx = screen[i, last, 0] - screen[i, after, 0]
@@ -260,21 +280,6 @@ def _visible_back(
                         factor = -change[k] * inverse[i, j] / near * weight[m]
                         moved[i, triangle[m], 0] += factor * slope[k, 0]
                         moved[i, triangle[m], 1] += factor * slope[k, 1]
-
-
-@numba.njit(cache=True)
-def _silhouette(
-    screen: np.ndarray, inverse: np.ndarray, triangles: np.ndarray, edge: np.ndarray
-) -> int:
-    """Return the vertex opposite to a silhouette edge in its visible triangle, −1 if it is none."""
-    one = _seen(screen, inverse, triangles[edge[2]])
-    other = _seen(screen, inverse, triangles[edge[3]])
-    if one == other:
-        return -1
-    for vertex in triangles[edge[2] if one else edge[3]]:
-        if vertex != edge[0] and vertex != edge[1]:
-            return int(vertex)
-    return -1
 
 
 @numba.njit(cache=True)
@@ -316,37 +321,15 @@ def _crossing(
 
 
 @numba.njit(cache=True)
-def _lines(p: np.ndarray, q: np.ndarray, axis: int, size: int) -> tuple[int, int]:
-    """Return the first row (``axis`` 0) or column whose centre an edge crosses, and the end."""
-    low, high = min(p[1 - axis], q[1 - axis]), max(p[1 - axis], q[1 - axis])
-    first, end = int(np.ceil(max(low, 0.0) - 0.5)), int(np.ceil(min(high, size) - 0.5))
-    return max(first, 0), min(end, size)
-
-
-@numba.njit(cache=True)
-def _most_crossings(
-    screen: np.ndarray, inverse: np.ndarray, triangles: np.ndarray, edges: np.ndarray, size: int
-) -> int:
-    """Return the number of crossings of silhouettes and centre lines, visible or not."""
-    most = 0
-    for i in range(len(screen)):
-        for e in range(len(edges)):
-            if _silhouette(screen[i], inverse[i], triangles, edges[e]) >= 0:
-                for axis in range(2):
-                    first, end = _lines(screen[i, edges[e, 0]], screen[i, edges[e, 1]], axis, size)
-                    most += max(end - first, 0)
-    return most
-
-
-@numba.njit(cache=True)
 def _crossings(
     places: np.ndarray,
     values: np.ndarray,
     nearness: np.ndarray,
     screen: np.ndarray,
     inverse: np.ndarray,
-    triangles: np.ndarray,
     edges: np.ndarray,
+    silhouettes: np.ndarray,
+    lines: np.ndarray,
     tolerance: float,
 ) -> int:
     """Find where visible silhouettes pass between neighbouring pixels; return the number N.
@@ -355,29 +338,24 @@ def _crossings(
     pixel inside and of the one outside; ``values`` (most, 3): the distance t from the former, the
     fraction s of the edge, and the share of rows or columns in the blending of this edge.
     """
-    size = nearness.shape[1]
     count = 0
-    for i in range(len(screen)):
-        for e in range(len(edges)):
-            inside = _silhouette(screen[i], inverse[i], triangles, edges[e])
-            if inside < 0:
-                continue
-            p, q = screen[i, edges[e, 0]], screen[i, edges[e, 1]]
-            length = (q[0] - p[0]) ** 2 + (q[1] - p[1]) ** 2
-            for axis in range(2):
-                first, end = _lines(p, q, axis, size)
-                for line in range(first, end):
-                    inner, outer, t, s = _crossing(
-                        nearness[i], screen[i], inverse[i], edges[e], inside, axis, line, tolerance
-                    )
-                    if t < 0:
-                        continue
-                    places[count, 0], places[count, 1], places[count, 2] = i, e, axis
-                    places[count, 3 + axis], places[count, 4 - axis] = line, inner
-                    places[count, 5 + axis], places[count, 6 - axis] = line, outer
-                    values[count, 0], values[count, 1] = t, s
-                    values[count, 2] = (q[1 - axis] - p[1 - axis]) ** 2 / length
-                    count += 1
+    for n in range(len(silhouettes)):
+        i, e, inside = silhouettes[n]
+        p, q = screen[i, edges[e, 0]], screen[i, edges[e, 1]]
+        length = (q[0] - p[0]) ** 2 + (q[1] - p[1]) ** 2
+        for axis in range(2):
+            for line in range(lines[n, axis, 0], lines[n, axis, 1]):
+                inner, outer, t, s = _crossing(
+                    nearness[i], screen[i], inverse[i], edges[e], inside, axis, line, tolerance
+                )
+                if t < 0:
+                    continue
+                places[count, 0], places[count, 1], places[count, 2] = i, e, axis
+                places[count, 3 + axis], places[count, 4 - axis] = line, inner
+                places[count, 5 + axis], places[count, 6 - axis] = line, outer
+                values[count, 0], values[count, 1] = t, s
+                values[count, 2] = (q[1 - axis] - p[1 - axis]) ** 2 / length
+                count += 1
     return count
 
 
