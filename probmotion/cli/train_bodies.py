@@ -188,7 +188,7 @@ class TrainImages:
     """Number of images to learn from, evenly spread over the clips."""
 
     rounds: int = 2
-    """Number of rounds; each estimates all poses (3 s per image), then surface, colours and
+    """Number of rounds; each estimates all poses (2.4 s per image), then surface, colours and
     features."""
 
     fov: float = 40.0

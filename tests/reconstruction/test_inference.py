@@ -217,6 +217,16 @@ def test_draws_of_a_mode_have_its_moments() -> None:
     assert mode.log_evidence == pytest.approx(-2.0 + np.log(volume))
 
 
+def test_evidence_decides_between_modes_but_not_fully() -> None:
+    high, wide = np.eye(1), 0.01 * np.eye(1)
+    modes = [Mode(np.array([100.0]), 0.0, high), Mode(np.array([-100.0]), -3.0, wide)]
+    evidence_ratio = np.exp(-3.0) * 10  # ten times as wide
+    draws = inference.mixture_draws(modes, np.random.default_rng(0), 40_000)
+    odds = (draws < 0).mean() / (draws > 0).mean()
+    assert evidence_ratio < 0.9 * odds < odds < 0.9
+    assert odds == pytest.approx(evidence_ratio**inference._CONFIDENCE, rel=0.05)
+
+
 def test_reconstruction_covers_the_mask_and_is_near_the_truth(animal) -> None:
     category, prior, made = animal
     result = reconstruct(observed(made, 0), category, draws=20, seed=1)
