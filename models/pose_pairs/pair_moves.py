@@ -21,9 +21,12 @@ __all__ = [
 
 SWING, SLIDE, STRETCH, CRANK, HINGE, TURN, SHIFT, APPROACH = range(8)
 """Kinds of moves, all but the last by :func:`propose`."""
-_APPROACHES = 40
+_APPROACHES = 20
 """Number of moves of the last kind for all people, and for each person half of them. They change
 the likelihood most."""
+_PLACEMENTS, _TRUNKS = 13, 7
+"""Numbers of moves of each kind that place a person, and that rotate a bone of the local frame.
+Most distances depend on them, so that their steps are small."""
 _UNIFORM_ANGLES = 0.3
 """Probability of a uniform angle for cranks and hinges."""
 
@@ -57,10 +60,13 @@ def moves_of(body: Body) -> np.ndarray:
     joints = range(len(body.parents))
     bones = np.flatnonzero(body.parents >= 0).tolist()
     children = [np.flatnonzero(body.parents == joint).tolist() for joint in joints]
-    moves = [(kind, joint, -1) for kind in (SWING, SLIDE, STRETCH) for joint in bones]
+    moves = [(STRETCH, joint, -1) for joint in bones]
+    for kind in (SWING, SLIDE):
+        for joint in bones:
+            moves += [(kind, joint, -1)] * (_TRUNKS if body.framing[joint] else 1)
     moves += [(CRANK, joint, children[joint][0]) for joint in bones if len(children[joint]) == 1]
     moves += [(HINGE, *pair) for siblings in children for pair in combinations(siblings, 2)]
-    moves += [(kind, root, -1) for kind in (TURN, SHIFT) for root in body.roots]
+    moves += [(kind, root, -1) for kind in (TURN, SHIFT) for root in body.roots] * _PLACEMENTS
     moves += [(APPROACH, -1, -1)] * _APPROACHES
     moves += [(APPROACH, root, -1) for root in body.roots for _ in range(_APPROACHES // 2)]
     return np.array(moves, dtype=np.int64)
