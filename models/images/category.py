@@ -181,6 +181,14 @@ class Category:
                 "channels; train a category on images with such features to use them"
             )
 
+    def check_images(self, images: int) -> None:
+        """Raise ``ValueError`` if a clip has more images than the motions have frames."""
+        if images > self.code.frames:
+            raise ValueError(
+                f"images must be at most {self.code.frames}, the frames of the category's motions, "
+                f"got {images}"
+            )
+
     def save(self, path: str | Path) -> None:
         """Write the category to an ``.npz`` file for :meth:`load`.
 

@@ -24,6 +24,7 @@ _TRANSPARENT = ("LA", "La", "PA", "RGBA", "RGBa")
 # Masks reach 1 inside the body. Those compressed with loss or predicted by networks nearly do;
 # labels such as 1 to 200 in 8 bits do not.
 _INSIDE = 0.9
+_LABELS = 32  # integers below are labels, of several bodies if there are more than 0 and 1
 # Grids of patches cover the image with cells that are nearly square, or have the image's aspect
 # ratio. Arrays with the channels first have other shapes.
 _MOST_ELONGATED = 4.0
@@ -199,6 +200,11 @@ def _mask(array: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
         )
     if array.dtype.kind in "iu" and array.min() >= 0 and array.max() <= 1:
         array = array.astype(bool)
+    elif array.dtype.kind in "iu" and array.min() >= 0 and array.max() < _LABELS:
+        raise ValueError(
+            f"mask must show one body, got labels 0 to {array.max()}; give one that is 1 or 255 in "
+            "the body and 0 elsewhere"
+        )
     values = _shares("mask", array)
     known = values[~np.isnan(values)]
     if known.size == 0 or known.max() == 0:

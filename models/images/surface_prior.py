@@ -118,11 +118,7 @@ class SurfacePrior(StandardNormalPrior):
         for value in self.tangent:
             check_positive("tangent", float(value))
         body, code = category.body, category.code
-        if len(self.tangent) > code.frames:
-            raise ValueError(
-                f"images must be at most {code.frames}, the frames of the category's motions, got "
-                f"{len(self.tangent)}"
-            )
+        category.check_images(len(self.tangent))
         self.skeleton, self.frames, self.fps = body.skeleton, code.frames, code.fps
         self.images = len(self.tangent)
         self.turned = np.tile(np.eye(3), (self.images, 1, 1))

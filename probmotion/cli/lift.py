@@ -163,8 +163,8 @@ class Reconstruct:
     """Reconstruct an animal or person from one image or the images of a clip, in 3D and motion.
 
     Writes to --out: reconstruct.html (the images, other views and posterior draws in motion),
-    body.glb (textured surface with a skeleton and a motion, for Blender), reconstruction.npz (the
-    motion and all draws) and summary.json.
+    body.glb (textured surface with a skeleton and four motions, for Blender), reconstruction.npz
+    (the first motion and all draws) and summary.json.
     """
 
     image: Positional[tuple[Path, ...]]
@@ -200,6 +200,7 @@ class Reconstruct:
         from probmotion.validation import check_count
 
         check_count("draws", self.draws, 2)
+        check_count("seed", self.seed, 0)
         category = Category.load(self.category)
         observation = ImageObservation.read(
             _one_or_all(self.image),
@@ -208,6 +209,7 @@ class Reconstruct:
             fov=self.fov,
         )
         category.check_features(observation.features)
+        category.check_images(observation.images)
         writable_folder(self.out)
         result = reconstruct(observation, category, draws=self.draws, seed=self.seed)
         result.save(self.out)

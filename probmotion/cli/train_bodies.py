@@ -223,7 +223,7 @@ class TrainImages:
         done = rounds_done(self.out)
         if done < self.rounds and steps_taken(self.out, KIND):
             raise ValueError(
-                f"rounds must be {done} to resume {self.out}, whose encoder is in training, got "
+                f"rounds must be {done} to resume {self.out}, whose encoder was trained, got "
                 f"{self.rounds}; use another folder"
             )
         if done < self.rounds:

@@ -102,7 +102,7 @@ def test_other_settings_are_refused(start, tmp_path, fails):
     for more, words in (
         (("--data-seed", 1), f"clips must be the same to resume {out}"),
         (("--clips", clip), f"clips must be the same to resume {out}"),
-        (("--rounds", 2), f"rounds must be 1 to resume {out}, whose encoder is in training, got 2"),
+        (("--rounds", 2), f"rounds must be 1 to resume {out}, whose encoder was trained, got 2"),
     ):
         assert fails(*command(start, out, "--rounds", 1, *more)).startswith(words)
     learnt = out / "category.npz"

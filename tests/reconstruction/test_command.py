@@ -86,6 +86,8 @@ def test_a_clip_is_reconstructed(asked, files, capsys):
         (["image0.png", "--mask", "mask0.png", "mask1.png"], "mask must be a single one"),
         (["image0.png", "--mask", "no.png"], "no.png"),
         (["image0.png", "--mask", "mask0.png", "--fov", "150"], "fov must be at most 120"),
+        (["image0.png", "--mask", "mask0.png", "--seed", "-1"], "seed must be an integer of at"),
+        (["image0.png"] * 11 + ["--mask"] + ["mask0.png"] * 11, "images must be at most 10"),
     ],
 )
 def test_errors_are_one_line_and_leave_no_files(asked, files, capsys, words, message):

@@ -285,6 +285,7 @@ def test_files_that_decode_to_many_pixels_are_refused(
         (0 * BODY, "must show the body, got no pixel of it"),
         (0 * BODY + 1, "must show the background, got the body in every pixel"),
         (128 * BODY, "must reach its full value in the body, got at most 0.502"),
+        (2 * BODY, "must show one body, got labels 0 to 2; give one that is 1 or 255"),
         (BODY[1:], r"the image's height and width \(180, 240\), got shape \(179, 240\)"),
         (np.dstack([BODY] * 3), "got shape"),
         (BODY * 7.0, "must be from 0 to 1, got 0 to 7"),
