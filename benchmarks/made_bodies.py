@@ -41,7 +41,8 @@ class Example(NamedTuple):
 class Bodies:
     """Bodies of a category in motions of held-out clips.
 
-    Images of a body do not depend on the number ``n`` of bodies.
+    Rotations of all ``n`` bodies are fitted with common bone lengths, so that images of a body
+    depend slightly on their number.
     """
 
     def __init__(self, name: str, data: Path | None, part: str, n: int) -> None:

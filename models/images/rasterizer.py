@@ -54,7 +54,10 @@ class Renderer(Protocol):
 
 
 class Rasterizer:
-    """Renderer on the processor, exact to a fraction of a pixel and deterministic."""
+    """Renderer on the processor, deterministic; exact to a fraction of a pixel but for thin limbs.
+
+    Values of pixels that several silhouettes cross may leave the range of those around them.
+    """
 
     def render(
         self,
