@@ -265,7 +265,7 @@ class Category:
             )
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(
-                f"{path.name} must be a category written by Category.save, got {error}"
+                f"{path.name} must be a category written by Category.save: {error}"
             ) from error
 
 

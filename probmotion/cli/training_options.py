@@ -17,13 +17,13 @@ _LISTED = 6  # maximum number of printed names
 
 @dataclass(frozen=True)
 class Steps:
-    """Optimisation settings; defaults depend on the network size."""
+    """Optimisation settings; defaults depend on the kind of network and its size."""
 
     steps: int | None = None
     """Number of gradient steps."""
 
     batch: int | None = None
-    """Number of sequences per step."""
+    """Number of sequences or images per step."""
 
     learning_rate: float | None = None
     """Learning rate after a linear warm-up."""
