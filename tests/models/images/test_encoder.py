@@ -193,5 +193,5 @@ def test_wrong_features_are_refused(category, tmp_path) -> None:
     older = str(arrays.pop("settings")).replace('"format": 2', '"format": 1')
     del arrays["feature_noise"]
     np.savez(tmp_path / "older.npz", settings=older, **arrays)
-    with pytest.raises(ValueError, match=r"written by Category\.save, got format 1"):
+    with pytest.raises(ValueError, match=r"written by Category\.save: format 1 instead of 2"):
         Category.load(tmp_path / "older.npz")
