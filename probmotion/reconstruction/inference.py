@@ -37,10 +37,9 @@ _STARTS, _KEPT = 12, 6  # draws that are refined, and modes that are refined to 
 # them that are refined, and modes that are refined to the end.
 _MOTIONS, _CERTAIN, _STARTS_CLIPS, _KEPT_CLIPS = 400, 0.7, 5, 2
 _CONFIDENCE = 0.35
-"""Power of the evidence in the weights of modes. It is below 1, since the likelihood is too
-confident about the reasons for small differences of images. Chosen on validation images of both
-categories by the continuous ranked probability score of joints, such that intervals of 90 % hold.
-"""
+"""Power of the evidence in the weights of modes. It is below 1, since the evidence exaggerates
+differences between modes. Chosen on validation images of both categories by the continuous ranked
+probability score of joints."""
 _UNLIKELY = 0.02  # probability of a quarter turn below which it is not refined
 _OUTLINE_ERROR, _UNUSUAL, _UNCOVERED = 0.1, 2.0, 0.08
 """Largest values of reconstructions that can be trusted.

@@ -136,6 +136,17 @@ def test_bodies_of_a_batch_are_independent() -> None:
     torch.testing.assert_close(draw(batch), separate, rtol=0, atol=0)
 
 
+def test_triangles_that_reach_behind_the_camera_are_not_drawn() -> None:
+    """The only triangle in front of the camera shows its inside, then its outside."""
+    corners = [[-0.3, -0.3, 2.0], [0.3, -0.3, 2.0], [0.0, 0.4, 2.0], [0.1, 0.0, -1.0]]
+    vertices = torch.tensor(corners, dtype=torch.float64)[None]
+    triangles = np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]])
+    for side, area in ((triangles, 0.0), (triangles[:, ::-1], 0.21)):
+        image = Rasterizer().render(vertices, side, torch.ones_like(vertices), TANGENT, SIZE)
+        pixel = 2 * TANGENT * 2.0 / SIZE
+        assert float(image[..., 3].sum()) * pixel**2 == pytest.approx(area, rel=0.05)
+
+
 def test_a_body_behind_the_camera_is_not_seen() -> None:
     assert float(draw(ball(0.5, (0.0, 0.0, -4.0))).sum()) == 0.0
 
