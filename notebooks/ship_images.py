@@ -58,8 +58,8 @@ encoder of {parameters:.1f} million weights.
 - **Provenance**: {provenance}
 - **Surface, shapes and colours**: not learnt; `Category.of_capsules`. `probmotion train images`
   learns them from clips of images.
-- **Encoder**: learnt from images that are rendered from draws of the category, with errors of masks
-  and images cut off; {steps} steps of {batch} images, and {more} of {fewer} for the silhouettes of
+- **Encoder**: learnt from images that are rendered from draws of the category, with coloured
+  backgrounds, errors of masks, and images cut off; {steps} steps of {batch} images, and {more} of {fewer} for the silhouettes of
   its means, too; {minutes:.0f} minutes of one core. Its negative log density of the parameters is
   {loss:.1f} nats on validation images, {before:.1f} before the silhouettes (that of the prior,
   without an image, is {prior:.1f}).

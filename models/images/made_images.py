@@ -35,6 +35,7 @@ _JITTER = 0.03  # standard deviation of the middle and log size of the box, of i
 _EDGE = 0.2  # standard deviation of errors of the mask's outline, in units of blurred coverage
 _BLUR = 0.01  # of the crop
 _SMOOTH = 0.02  # their correlation length, of the crop
+_PATCH = 0.1  # correlation length of backgrounds, of the crop
 _PART, _FEATURE_NOISE = 0.2, 0.5  # length over which features vary, of the size, and their noise
 _TANGENTS = (0.05, 0.35)  # of clips' crops
 # Made categories: standard deviations of the logarithm of the distance from the bones, of
@@ -63,8 +64,9 @@ def make_images(
 ) -> MadeImages:
     """Return ``n`` images of draws of a prior of one image, or of given θ moved into the crop.
 
-    A quarter of them is cut off at one side. Outlines of masks have smooth random errors, and
-    features smooth noise. Masks and colours do not depend on whether there are features.
+    A quarter of them is cut off at one side. Backgrounds have smooth random colours, outlines of
+    masks smooth random errors, and features smooth noise. Masks and colours do not depend on
+    whether there are features.
     """
     theta = prior.initial(rng, n) if theta is None else np.array(theta)
     cut = np.where(rng.random(n) < _CUT, rng.uniform(0.05, _MOST_CUT, n), 0.0)
@@ -108,10 +110,14 @@ def make_images(
         )
         mask[k][(slice(None), outside) if axis == 0 else outside] = np.nan
     beyond = np.isnan(mask)[..., None]
-    rgb = np.where(beyond, np.nan, np.clip(values[..., :3], 0.0, 1.0))
+    of_features, of_background = rng.spawn(2)
+    share = np.clip(coverage, 0.0, 1.0)[..., None]
+    behind = _backgrounds(of_background, n, size)
+    rgb = share * np.clip(values[..., :3], 0.0, 1.0) + (1 - share) * behind
+    rgb = np.where(beyond, np.nan, rgb)
     features = None
     if values.shape[3] > 3:
-        features = values[..., 3:] + _feature_errors(prior.category, rng.spawn(1)[0], n, size)
+        features = values[..., 3:] + _feature_errors(prior.category, of_features, n, size)
         features = np.where(beyond, np.nan, features).astype(np.float32)
     return MadeImages(theta, mask, rgb, features)
 
@@ -176,6 +182,14 @@ def make_clips(
             images.append(ImageObservation(*seen, tangent, np.eye(3)[None]))
         parameters.append(made.theta)
     return images, np.concatenate(parameters)
+
+
+def _backgrounds(rng: np.random.Generator, n: int, size: int) -> np.ndarray:
+    """Return smooth random colours behind bodies, (n, size, size, 3)."""
+    noise = rng.standard_normal((n, size, size, 3))
+    noise = ndimage.gaussian_filter(noise, (0, _PATCH * size, _PATCH * size, 0), mode="wrap")
+    colours: np.ndarray = rng.uniform(0, 1, (n, 1, 1, 3)) + 0.2 * noise / noise.std()
+    return np.clip(colours, 0.0, 1.0)
 
 
 def _feature_errors(category: Category, rng: np.random.Generator, n: int, size: int) -> np.ndarray:

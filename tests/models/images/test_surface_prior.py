@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scipy.ndimage import maximum_filter
+from scipy.ndimage import distance_transform_edt, maximum_filter
 from scipy.spatial.transform import Rotation
 
 from probmotion.models.images.image_likelihood import ImageLikelihood
@@ -241,6 +241,29 @@ def test_features_of_others_are_refused(cases) -> None:
         ValueError, match=r"have 3 channels for the category \w+, got 2 channels; train"
     ):
         MotionPosterior(described, fewer)
+
+
+def test_backgrounds_are_behind_the_bodies(prior, made) -> None:
+    """Pixels have the colours of the body and of the background by the body's share of them."""
+    with torch.no_grad():
+        images = prior.render(torch.as_tensor(made.theta).float(), SIZE)[:, 0].double().numpy()
+    colours, share = images[..., :3], images[..., 3]
+    known = np.isfinite(made.mask)
+    inside, outside = np.abs(share - 1) < 1e-3, share == 0
+    both = (share > 0.1) & (share < 0.9)
+    np.testing.assert_allclose(
+        made.rgb[inside & known], np.clip(colours[inside & known], 0, 1), atol=1e-3
+    )
+    behind = (made.rgb - colours)[both & known] / (1 - share[both & known])[:, None]
+    nearest = np.array(
+        [distance_transform_edt(~each, return_indices=True)[1] for each in outside & known]
+    )
+    frame, row, column = np.nonzero(both & known)
+    beside = made.rgb[frame, nearest[frame, 0, row, column], nearest[frame, 1, row, column]]
+    assert np.abs(behind - beside).mean() < 0.03  # the background is smooth
+    seen = [made.rgb[k][outside[k] & known[k]] for k in range(len(share))]
+    assert np.std([each.mean(axis=0) for each in seen], axis=0).min() > 0.1
+    assert min(each.std(axis=0).max() for each in seen) > 0.05
 
 
 def test_made_images_with_features(cases) -> None:
