@@ -113,7 +113,7 @@ def make_images(
     of_features, of_background = rng.spawn(2)
     share = np.clip(coverage, 0.0, 1.0)[..., None]
     behind = _backgrounds(of_background, n, size)
-    rgb = share * np.clip(values[..., :3], 0.0, 1.0) + (1 - share) * behind
+    rgb = np.clip(share * values[..., :3] + (1 - share) * behind, 0.0, 1.0)
     rgb = np.where(beyond, np.nan, rgb)
     features = None
     if values.shape[3] > 3:
