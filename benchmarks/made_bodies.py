@@ -15,7 +15,12 @@ from probmotion.data.synthetic import animal_clips, walk_clips
 from probmotion.models.bodies.turn_fit import fit_turns
 from probmotion.models.images.category import Category
 from probmotion.models.images.encoder_training import encoder_of
-from probmotion.models.images.made_images import MARGIN, make_images, with_made_features
+from probmotion.models.images.made_images import (
+    MARGIN,
+    in_front,
+    make_images,
+    with_made_features,
+)
 from probmotion.models.images.observation import ImageObservation
 from probmotion.models.images.surface_prior import _PITCH, _ROLL, SurfacePrior
 from probmotion.models.latent.turn_code import TurnCode
@@ -75,7 +80,7 @@ class Bodies:
         The camera moves with the body without turning, such that the middle of its trunk is at one
         place, and all of the body is in all images. Masks have no errors.
         """
-        _, prior, theta = self._posed(number, self.fit.turns[number] if turns is None else turns)
+        rng, prior, theta = self._posed(number, self.fit.turns[number] if turns is None else turns)
         for _ in range(PASSES):
             points = prior.vertices(torch.as_tensor(theta))[:, 0].numpy()
             points = points[..., :2] / (points[..., 2:] * TANGENT)
@@ -87,8 +92,8 @@ class Bodies:
             rows = torch.as_tensor(theta, dtype=torch.float32)
             images = prior.render(rows, SIZE, True)[:, 0].numpy()
         mask = images[..., -1].clip(0.0, 1.0)
-        values = images[..., :-1] / np.maximum(mask, 0.05)[..., None]
-        return _example(prior, theta, mask, values[..., :3].clip(0.0, 1.0), values[..., 3:])
+        features = images[..., 3:-1] / np.maximum(mask, 0.05)[..., None]
+        return _example(prior, theta, mask, in_front(images, rng), features)
 
     def _posed(
         self, number: int, turns: np.ndarray

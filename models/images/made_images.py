@@ -20,6 +20,7 @@ from probmotion.validation import check_count
 __all__ = [
     "MARGIN",
     "MadeImages",
+    "in_front",
     "make_category",
     "make_clips",
     "make_images",
@@ -98,7 +99,6 @@ def make_images(
     blur = _BLUR * size
     outline = ndimage.gaussian_filter(coverage, (0, blur, blur)) + noise
     mask = np.clip(4.0 * (outline - 0.5) + 0.5, 0.0, 1.0)
-    values = images[..., :-1] / np.maximum(coverage, 0.05)[..., None]
     centres = 2 * (np.arange(size) + 0.5) / size - 1
     for k in np.flatnonzero(cut > 0).tolist():
         axis = side[k] % 2
@@ -111,15 +111,25 @@ def make_images(
         mask[k][(slice(None), outside) if axis == 0 else outside] = np.nan
     beyond = np.isnan(mask)[..., None]
     of_features, of_background = rng.spawn(2)
-    share = np.clip(coverage, 0.0, 1.0)[..., None]
-    behind = _backgrounds(of_background, n, size)
-    rgb = np.clip(share * values[..., :3] + (1 - share) * behind, 0.0, 1.0)
-    rgb = np.where(beyond, np.nan, rgb)
+    rgb = np.where(beyond, np.nan, in_front(images, of_background))
     features = None
-    if values.shape[3] > 3:
-        features = values[..., 3:] + _feature_errors(prior.category, of_features, n, size)
+    if images.shape[3] > 4:
+        features = images[..., 3:-1] / np.maximum(coverage, 0.05)[..., None]
+        features += _feature_errors(prior.category, of_features, n, size)
         features = np.where(beyond, np.nan, features).astype(np.float32)
     return MadeImages(theta, mask, rgb, features)
+
+
+def in_front(images: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return rendered images (n, S, S, C) in front of smooth random colours, (n, S, S, 3)."""
+    n, size = images.shape[:2]
+    noise = rng.standard_normal((n, size, size, 3))
+    noise = ndimage.gaussian_filter(noise, (0, _PATCH * size, _PATCH * size, 0), mode="wrap")
+    colours = np.clip(rng.uniform(0, 1, (n, 1, 1, 3)) + 0.2 * noise / noise.std(), 0.0, 1.0)
+    coverage = images[..., -1:]
+    body = images[..., :3] / np.maximum(coverage, 1.0)  # blending at corners can exceed 1 slightly
+    blended: np.ndarray = np.clip(body + (1 - coverage.clip(0.0, 1.0)) * colours, 0.0, 1.0)
+    return blended
 
 
 def make_category(category: Category, rng: np.random.Generator) -> Category:
@@ -182,14 +192,6 @@ def make_clips(
             images.append(ImageObservation(*seen, tangent, np.eye(3)[None]))
         parameters.append(made.theta)
     return images, np.concatenate(parameters)
-
-
-def _backgrounds(rng: np.random.Generator, n: int, size: int) -> np.ndarray:
-    """Return smooth random colours behind bodies, (n, size, size, 3)."""
-    noise = rng.standard_normal((n, size, size, 3))
-    noise = ndimage.gaussian_filter(noise, (0, _PATCH * size, _PATCH * size, 0), mode="wrap")
-    colours: np.ndarray = rng.uniform(0, 1, (n, 1, 1, 3)) + 0.2 * noise / noise.std()
-    return np.clip(colours, 0.0, 1.0)
 
 
 def _feature_errors(category: Category, rng: np.random.Generator, n: int, size: int) -> np.ndarray:
