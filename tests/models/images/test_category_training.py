@@ -23,14 +23,14 @@ from probmotion.models.vae.motion_vae import MotionVAE
 
 @pytest.fixture(scope="module")
 def case():
-    """A category, a made one with features, 20 images of that and their θ."""
+    """A category, a made one with features, 40 images of that and their θ."""
     body, rng = MotionVAE.load("animal-vae").body, np.random.default_rng(0)
     turns = 0.15 * rng.standard_normal((4, 1, len(body.bones), 3))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "rest_surface", lambda body: rest_surface(body, 250))
         category = Category.of_capsules("animal", body, TurnCode(0 * turns[0], turns, 10.0))
     true = with_made_features(make_category(category, rng), 3)
-    return category, true, *make_clips(true, rng, 20, 1, 32)
+    return category, true, *make_clips(true, rng, 40, 1, 64)
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def errors(category, true):
 
 
 def test_errors_of_surface_and_albedo_fall(case, learnt):
-    """With true poses, 20 images remove more than a third and a half of the errors."""
+    """With true poses, 40 images remove more than a third and a half of the errors."""
     category, true, _, _ = case
     assert (errors(learnt, true) / errors(category, true) < [0.66, 0.5]).all()
 
