@@ -154,8 +154,8 @@ pd.Series(compared(result, truth)).round(2)
 # Seen from behind, an animal and its mirror image have nearly the same silhouette, and depth is seen only through
 # perspective. Another image shows what remains: below, draws given its mask alone, seen by the camera and from above, where
 # it did not look; and draws given its colours, too. The truth is in black. Here, the mask tells that the animal faces
-# away; given the colours, too, a third of the draws faces slightly to the right, the others to the left. The guide to
-# `probmotion reconstruct` has the errors of many images.
+# away; one draw in nine faces slightly to the right given the mask alone, and nine in ten given the colours, too. The guide
+# to `probmotion reconstruct` has the errors of many images.
 
 # %%
 other = make_images(prior, np.random.default_rng(21), 1, 128)
@@ -194,10 +194,10 @@ pd.DataFrame({name: compared(each, other_truth) for name, each in results.items(
 # ## 5. Another sampler
 #
 # The draws above are from Gaussians about modes that are wider than the posterior: they count 2 % of the image's
-# information, and modes are weighted by a power of their evidence. An image is an observation like any other, and `pm.posterior(prior, observation)` is the posterior for
-# every sampler of densities. Metropolis-Hastings starts at the draws and approximates nothing, but in a minute it does not
-# converge: the density has many narrow modes, and chains keep much of the spread of their starts. They show that the draws
-# lead to bodies of higher density, not how wide the posterior is.
+# information, and modes are weighted by a power of their evidence. An image is an observation like any other, and
+# `pm.posterior(prior, observation)` is the posterior for every sampler of densities. Metropolis-Hastings starts at the draws
+# and approximates nothing, but in a minute it does not converge: the density has many narrow modes, and chains keep much of
+# the spread of their starts. They show that the draws lead to bodies of higher density, not how wide the posterior is.
 
 # %%
 silhouette = results["mask alone"]
