@@ -12,6 +12,7 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+from scipy import ndimage
 
 from probmotion.extras import torch
 from probmotion.io.body_mesh import BodyMesh, Texture
@@ -153,7 +154,10 @@ def _sampled(
     """
     assert observation.rgb is not None
     size, rgb = observation.size, observation.rgb[frame]
-    usable = (observation.mask[frame] >= _INSIDE) & np.isfinite(rgb).all(axis=-1)
+    mask = observation.mask[frame]
+    # Pixels beside the outline may show the background, too.
+    beside = ndimage.binary_dilation(mask < 0.5)
+    usable = (mask >= _INSIDE) & ~beside & np.isfinite(rgb).all(axis=-1)
     rgb = np.where(usable[..., None], rgb, 0.0)
     z = np.where(points[:, 2] > 0, points[:, 2], np.inf)
     pixels = 0.5 * size * (1 + points[:, :2] / (z * tangent)[:, None]) - 0.5  # column and row
