@@ -19,6 +19,7 @@ from probmotion.models.images.surface_prior import SurfacePrior
 from probmotion.models.latent.turn_code import TurnCode
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.reconstruction.moving_surface import surface_frames
+from probmotion.samplers import SequentialMonteCarlo
 from tests.models.images.meshes import icosphere
 
 SIZE, TANGENT = 64, 0.15
@@ -163,6 +164,25 @@ def test_curvature_has_the_gradient_of_the_density(cases, case) -> None:
     rows = derivatives[:, likelihood.known & (likelihood.mask > 0.5), 3:-1]
     rows = (rows / likelihood.feature_noise).flatten(1)
     torch.testing.assert_close(information - without, 0.05 * rows @ rows.T)
+
+
+def test_particles_find_the_body(prior) -> None:
+    """Draws of the prior are annealed to bodies as probable as the true one, and alike."""
+    made = make_images(prior, np.random.default_rng(0), 1, 16)
+    posterior = MotionPosterior(prior, observed(made, 0))
+    sampler = SequentialMonteCarlo(particles=32, candidates=200, gradients=False)
+    draws = sampler.sample(posterior, draws=32, seed=1, progress=False)
+    truth = float(posterior.log_density(made.theta)[0])
+    first = posterior.log_density(prior.initial(np.random.default_rng(1), 200))
+    assert np.max(first) < truth - 100
+    assert np.median(draws.dataset["log_density"]) > truth - prior.dim
+    theta = draws.dataset["theta"].values[0]
+    with torch.no_grad():
+        seen = prior.render(torch.as_tensor(theta).float(), 16)[:, 0, ..., -1].numpy() > 0.5
+    mask = made.mask[0] > 0.5
+    overlap = (seen & mask).sum(axis=(1, 2)) / (seen | mask).sum(axis=(1, 2))
+    assert np.median(overlap) > 0.6
+    assert np.cos(prior.yaw(theta) - prior.yaw(made.theta)).mean() > 0.5
 
 
 def test_features_have_a_gaussian_density(cases) -> None:
