@@ -155,10 +155,13 @@ def _sampled(
     assert observation.rgb is not None
     size, rgb = observation.size, observation.rgb[frame]
     mask = observation.mask[frame]
-    # Pixels beside the outline may show the background, too.
-    beside = ndimage.binary_dilation(mask < 0.5)
-    usable = (mask >= _INSIDE) & ~beside & np.isfinite(rgb).all(axis=-1)
-    rgb = np.where(usable[..., None], rgb, 0.0)
+    usable = (mask >= _INSIDE) & np.isfinite(rgb).all(axis=-1)
+    # Pixels beside the outline may show the background, too: they get the colour of the nearest
+    # pixel that does not, if it is next to them.
+    clean = usable & ~ndimage.binary_dilation(mask < 1 - _INSIDE)
+    distance, nearest = ndimage.distance_transform_edt(~clean, return_indices=True)
+    usable &= (distance < 2) & clean.any()
+    rgb = np.where(usable[..., None], rgb[tuple(nearest)], 0.0)
     z = np.where(points[:, 2] > 0, points[:, 2], np.inf)
     pixels = 0.5 * size * (1 + points[:, :2] / (z * tangent)[:, None]) - 0.5  # column and row
     pixels = np.clip(pixels, -2.0, size + 1.0)

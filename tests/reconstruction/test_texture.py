@@ -113,8 +113,8 @@ def test_texels_that_images_show_have_the_reflectance_of_the_body(view):
     colours = view.centres(view.observation)
     errors = np.abs(colours - view.coat).max(axis=1)[view.seen]
     assert view.seen.sum() > 80
-    # Texels beside outlines have the reflectance of θ, since pixels there may show the background.
-    assert np.quantile(errors, 0.85) < 0.03
+    # Texels close to outlines mix it with the reflectance of θ.
+    assert np.quantile(errors, 0.9) < 0.03
     differences = np.abs(view.expected - view.coat).max(axis=1)[view.seen]
     assert np.median(differences) > 0.15
 
