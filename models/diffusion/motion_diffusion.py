@@ -69,6 +69,8 @@ class MotionDiffusion(TrackNetwork):
                 f"{self.frames}"
             )
         super().__init__(network, settings, standards, skeleton, fps, **options)
+        self._mean = self._tensor(standards.mean / self.scale)
+        self._deviation = self._tensor(standards.deviation / self.scale)
 
     @classmethod
     def load(
@@ -217,8 +219,7 @@ class MotionDiffusion(TrackNetwork):
     def _network_at(self, alpha_bar: float) -> Callable[[torch.Tensor], torch.Tensor]:
         """Return the map from noisy to clean motions (N, L, J, 2) at a noise level."""
         level, signal = self.settings.level(alpha_bar), math.sqrt(alpha_bar)
-        mean = self._tensor(self.standards.mean / self.scale)
-        deviation = self._tensor(self.standards.deviation / self.scale)
+        mean, deviation = self._mean, self._deviation
         spread = torch.sqrt(alpha_bar * deviation**2 + (1 - alpha_bar))
 
         def denoise(noisy: torch.Tensor) -> torch.Tensor:

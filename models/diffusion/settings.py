@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -93,7 +94,7 @@ class DiffusionSettings(TransformerSettings):
         """Return the size in the MAS authors' released code."""
         return cls(frames, layers=8, schedule_power=4)
 
-    @property
+    @cached_property
     def schedule(self) -> NoiseSchedule:
         """Noise levels of the cosine schedule."""
         return NoiseSchedule.cosine(self.steps, power=self.schedule_power)

@@ -184,11 +184,11 @@ class Cameras:
 
     def depth(self, points: Array) -> Array:
         """Return depths along the cameras' z axes: ``(…, L, J, 3) → (…, V, L, J)``, metres."""
-        forward = constant(self.rotation[:, 2], points)
-        depth = constant(self.translation[:, 2], points)
         xp = array_namespace(points)
-        along = xp.sum(points[..., None, :, :, :] * forward[:, None, None, :], axis=-1)
-        return along + depth[:, None, None]
+        depth = constant(self.translation[:, 2], points)
+        along = xp.matmul(constant(self.rotation[:, 2:], points), _columns(points))
+        depth = along + depth[:, None, None]
+        return xp.reshape(depth, (*points.shape[:-3], self.n_views, *points.shape[-3:-1]))
 
     def project(self, points: Array) -> Array:
         """Return image points: ``(…, L, J, 3) → (…, V, L, J, 2)``, image units.
@@ -200,16 +200,18 @@ class Cameras:
         """
         check_shape("points", points, ("…", "L", "J", 3))
         xp = array_namespace(points)
-        axes = constant(self.image_axes, points)
-        # (…, 1, L, J, 3) @ (V, 1, 3, 2)
-        plane = xp.matmul(points[..., None, :, :, :], xp.matrix_transpose(axes)[:, None, :, :])
+        # Coordinates before points, (…, V, 2, L J): NumPy is slow along axes of two entries.
+        image = xp.matmul(constant(self.image_axes, points), _columns(points))
         if self.orthographic:
-            return plane + constant(self.offset, points)[:, None, None, :]
-        shift = self.focal[:, None] * self.translation[:, :2]
-        depth = self.depth(points)
-        self._check_in_front(depth)
-        centre = constant(self.centre, points)[:, None, None, :]
-        return (plane + constant(shift, points)[:, None, None, :]) / depth[..., None] + centre
+            image = image + constant(self.offset, points)[..., None]
+        else:
+            shift = constant(self.focal[:, None] * self.translation[:, :2], points)
+            depth = self.depth(points)
+            self._check_in_front(depth)
+            depth = xp.reshape(depth, (*image.shape[:-2], 1, image.shape[-1]))
+            image = (image + shift[..., None]) / depth + constant(self.centre, points)[..., None]
+        shape = (*points.shape[:-3], self.n_views, *points.shape[-3:-1], 2)
+        return xp.reshape(xp.matrix_transpose(image), shape)
 
     def _check_in_front(self, depth: Array) -> None:
         if type(depth).__name__.endswith("Tracer"):
@@ -221,3 +223,10 @@ class Cameras:
                 f"points must be in front of every camera, got depth {depth.min():.3g} m in "
                 f"camera {view}; move the cameras away or centre the motion"
             )
+
+
+def _columns(points: Array) -> Array:
+    """Return the points as columns, ``(…, L, J, 3) → (…, 1, 3, L J)``."""
+    xp = array_namespace(points)
+    *batch, L, J, _ = points.shape
+    return xp.matrix_transpose(xp.reshape(points, (*batch, 1, L * J, 3)))

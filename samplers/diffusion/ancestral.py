@@ -14,13 +14,13 @@ import numpy as np
 
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.samplers.diffusion.guidance import can_guide
-from probmotion.samplers.diffusion.integrators import AnyIntegrator, Transition
+from probmotion.samplers.diffusion.integrators import AnyIntegrator, SecondOrderSDE, Transition
 from probmotion.samplers.diffusion.noise_levels import NoiseLevels, check_object
 from probmotion.samplers.diffusion.states import State
 from probmotion.samplers.independent import Batches, IndependentSampler
 from probmotion.seeds import NormalStreams
 
-__all__ = ["AncestralSampler", "Corrector", "ancestral", "reverse_diffusion"]
+__all__ = ["AncestralSampler", "Corrector", "ancestral", "check_integrator", "reverse_diffusion"]
 
 
 Corrector = Callable[[State, NormalStreams, np.ndarray, int], np.ndarray]
@@ -84,18 +84,28 @@ def reverse_diffusion(
     return clean
 
 
+def check_integrator(integrator: object, steps: int) -> None:
+    """Raise ``ValueError`` unless the argument is an integrator for this number of steps."""
+    check_object("integrator", integrator, AnyIntegrator)
+    if isinstance(integrator, SecondOrderSDE) and steps < 3:
+        raise ValueError(
+            "integrator SecondOrderSDE() requires estimates of two levels, and its first step has "
+            f"one: steps must be at least 3, got {steps}; otherwise use integrator=DDPM()"
+        )
+
+
 class AncestralSampler(NoiseLevels, IndependentSampler):
     """Base class of diffusion samplers of 3D motions."""
 
     draws_from = staticmethod(can_guide)
     effort: ClassVar[tuple[str, ...]] = ("steps",)
-    least_effort: ClassVar[int] = 2
+    least_effort: ClassVar[int] = 3
 
     integrator: AnyIntegrator
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_object("integrator", self.integrator, AnyIntegrator)
+        check_integrator(self.integrator, self.schedule.steps)
 
     def _batches(self, posterior: MotionPosterior, seed: int, progress: bool) -> Batches:
         if getattr(self, "elevation", None) == 0:

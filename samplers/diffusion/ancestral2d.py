@@ -19,13 +19,12 @@ from probmotion.posteriors.sampling import (
     require,
     suited,
 )
-from probmotion.samplers.diffusion.ancestral import ancestral
+from probmotion.samplers.diffusion.ancestral import ancestral, check_integrator
 from probmotion.samplers.diffusion.integrators import DDPM, AnyIntegrator
 from probmotion.samplers.diffusion.noise_levels import (
     AnyLevels,
     Cosine,
     NoiseLevels,
-    check_object,
 )
 from probmotion.samplers.diffusion.states import MotionState
 from probmotion.seeds import NormalStreams
@@ -62,7 +61,7 @@ class Ancestral2D(NoiseLevels):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_object("integrator", self.integrator, AnyIntegrator)
+        check_integrator(self.integrator, self.schedule.steps)
 
     def sample_views(
         self,

@@ -116,6 +116,19 @@ def test_optimised_motions_are_modes_without_spread(gaussian, keypoints):
     assert (residual[:, seen] ** 2).mean() < 0.1 * (prior_residual[seen] ** 2).mean()
 
 
+def test_regularisation_balances_residual_and_prior(gaussian_motion):
+    """At a constant level, steps of a standard normal end at the root of the mean gradient."""
+    prior = gaussian_motion(np.zeros((1, 2, 3)), np.eye(6))
+    posterior = MotionPosterior(prior, Joints3D(np.full((1, 2, 3), 0.8), noise=0.5))
+    sigmas, streams = np.ones(300), NormalStreams([np.random.default_rng(i) for i in range(400)])
+    for weight in (0.25, 1.0):
+        sampler = REDDiff(weight=weight)
+        given = sampler._pools(posterior), sampler._observations(posterior), (1, 2, 3)
+        mean = sampler._draw(*given, sigmas, streams, lambda: None).mean()
+        # (μ − y) + λ (μ − E[D(μ + ε)]) = 0 with D(x) = x/2.
+        assert mean == pytest.approx(0.8 / (1 + weight / 2), abs=0.01)
+
+
 @pytest.mark.parametrize("sampler", QUICK, ids=lambda sampler: sampler.name)
 @pytest.mark.parametrize("denoiser", ["3d", "2d"])
 def test_draws_do_not_depend_on_the_batch(gaussian, keypoints, sampler, denoiser):

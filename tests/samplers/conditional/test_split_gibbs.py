@@ -50,6 +50,16 @@ def test_draws_are_exact_with_several_cameras(gaussian, keypoints, assert_covari
     assert_exact(SplitGibbs(steps=60, sweeps=6), gaussian, seen, assert_covariance)
 
 
+def test_draws_from_views_are_exact_where_these_agree(
+    gaussian, gaussian_motion, keypoints, assert_covariance
+):
+    """The three coordinates are independent and alike, so that every view has the 3D estimate."""
+    between = gaussian.covariance.reshape(4, 3, 4, 3).trace(axis1=1, axis2=3)
+    prior = gaussian_motion(gaussian.mean, np.kron(between, np.eye(3)), scale=0.7)
+    sampler = SplitGibbs(steps=60, sweeps=6, denoiser="2d")
+    assert_exact(sampler, prior, keypoints, assert_covariance)
+
+
 def exact_draws(mean, covariance, rng):
     x = rng.normal(size=(SWEPT, mean.size)) @ np.linalg.cholesky(covariance).T
     return mean + x.reshape(SWEPT, *mean.shape)

@@ -10,9 +10,14 @@ import numpy as np
 import pytest
 
 from probmotion import MotionPosterior
-from probmotion.samplers import MultiViewPredictorCorrector
+from probmotion.samplers import (
+    Ancestral3D,
+    MultiViewAncestral,
+    MultiViewPredictorCorrector,
+)
 from probmotion.samplers.diffusion import DDIM, DDPM, Cosine, Heun, Karras, LogSNR, SecondOrderSDE
 from probmotion.samplers.diffusion.ancestral import ancestral
+from probmotion.samplers.diffusion.ancestral2d import Ancestral2D
 from probmotion.samplers.diffusion.states import MotionState
 from probmotion.samplers.diffusion.views import MotionDenoiser, pools, view_sets
 from probmotion.seeds import NormalStreams
@@ -171,3 +176,11 @@ def test_levels_are_between_the_limits(levels):
     scores = [schedule.sigma(t) for t in range(1, 21)]
     spacing = np.log(scores) if isinstance(levels, LogSNR) else np.power(scores, 1 / levels.rho)
     np.testing.assert_allclose(np.diff(spacing), np.diff(spacing)[0])
+
+
+@pytest.mark.parametrize("kind", [Ancestral2D, Ancestral3D, MultiViewAncestral])
+def test_a_second_order_step_requires_a_history(kind):
+    kind(steps=3, levels=Cosine(), integrator=SecondOrderSDE())
+    kind(steps=2, levels=Cosine(), integrator=DDPM())
+    with pytest.raises(ValueError, match=r"at least 3, got 2; .* integrator=DDPM\(\)"):
+        kind(steps=2, levels=Cosine(), integrator=SecondOrderSDE())

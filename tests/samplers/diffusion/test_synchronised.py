@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from probmotion import MotionPosterior
+from probmotion import Joints3D, MotionPosterior
 from probmotion.samplers import MultiViewAncestral
 from probmotion.samplers.diffusion import DDIM, StochSync, SyncTweedies
 from probmotion.samplers.diffusion.views import view_sets
@@ -21,23 +21,55 @@ def test_sync_tweedies_is_mas_with_deterministic_steps(gaussian):
     assert draws.counts == {"denoiser": 8 * 5 * 3}
 
 
-def test_stochastic_synchronisation_has_the_exact_variance(gaussian_motion, assert_covariance):
-    """For an isotropic prior, views agree and each level is a linear map with new noise."""
-    prior = gaussian_motion(np.zeros((1, 2, 3)), 0.3 * np.eye(6))
-    sampler = StochSync(steps=6, ode_steps=3)
-    schedule, variance = sampler.schedule, 0.0
+VARIANCE = 0.3  # of an isotropic prior, for which views agree and every level is linear
+SEEN = 0.8  # both joints, as one further view of each axis beside two of the sampler
+
+
+def isotropic(gaussian_motion, observed):
+    prior = gaussian_motion(np.zeros((1, 2, 3)), VARIANCE * np.eye(6))
+    seen = Joints3D(np.full((1, 2, 3), SEEN), noise=0.1) if observed else None
+    return MotionPosterior(prior, seen)
+
+
+def assert_moments(drawn, mean, variance, assert_covariance):
+    assert_covariance(drawn - mean, variance * np.eye(6))
+    assert drawn.mean() == pytest.approx(mean, abs=5 * math.sqrt(variance / drawn.size))
+
+
+@pytest.mark.parametrize("observed", [False, True])
+def test_deterministic_synchronisation_is_linear(gaussian_motion, assert_covariance, observed):
+    weight = 1 / 3 if observed else 0.0
+    sampler = SyncTweedies(steps=6)
+    mean, gain = 0.0, 1 / math.sqrt(sampler.schedule.alpha_bar[6])
     for t in range(6, 0, -1):
-        gain = 1.0
+        sigma = sampler.schedule.sigma(t)
+        ratio = sampler.schedule.sigma(t - 1) / sigma if t > 1 else 0.0
+        shrink = (1 - weight) * VARIANCE / (VARIANCE + sigma**2)
+        gain *= ratio + (1 - ratio) * shrink
+        mean = ratio * mean + (1 - ratio) * (shrink * mean + weight * SEEN)
+    posterior = isotropic(gaussian_motion, observed)
+    drawn = sampler.sample(posterior, draws=6000, progress=False).flat()
+    assert_moments(drawn, mean, gain**2, assert_covariance)
+
+
+@pytest.mark.parametrize("observed", [False, True])
+def test_stochastic_synchronisation_is_linear(gaussian_motion, assert_covariance, observed):
+    weight = 1 / 3 if observed else 0.0
+    sampler = StochSync(steps=6, ode_steps=3)
+    schedule, mean, variance = sampler.schedule, 0.0, 0.0
+    for t in range(6, 0, -1):
+        gain = 1 - weight
         below = np.geomspace(schedule.sigma(t), schedule.sigma(1), 3)
         for now, after in zip(below, [*below[1:], 0.0], strict=True):
-            shrink = 0.3 / (0.3 + now**2)
+            shrink = VARIANCE / (VARIANCE + now**2)
             gain *= shrink + after / now * (1 - shrink)
+        mean = gain * mean + weight * SEEN
         variance = gain**2 * (variance + schedule.sigma(t) ** 2)
-    draws = sampler.sample(MotionPosterior(prior), draws=6000, seed=2, progress=False)
-    assert_covariance(draws.flat(), variance * np.eye(6))
+    draws = sampler.sample(isotropic(gaussian_motion, observed), draws=6000, seed=2, progress=False)
+    assert_moments(draws.flat(), mean, variance, assert_covariance)
     assert draws.counts == {"denoiser": 6 * 3 * 3 * 6000}
     with pytest.raises(AssertionError, match="of the limit"):
-        assert_covariance(draws.flat(), 0.3 * np.eye(6))
+        assert_covariance(draws.flat() - mean, VARIANCE * np.eye(6))
 
 
 def test_learnt_denoisers_have_rings_of_views(gaussian):

@@ -17,7 +17,7 @@ from probmotion.samplers.diffusion.ancestral2d import Ancestral2D
 
 @pytest.mark.parametrize("kind", [MultiViewAncestral, MultiViewPredictorCorrector])
 def test_elevation_0_warns(gaussian, kind):
-    sampler = kind(steps=2, elevation=0.0)
+    sampler = kind(steps=3, elevation=0.0)
     message = f"{sampler.name} cannot distinguish a motion from its mirror image with elevation 0"
     with pytest.warns(UserWarning, match=message) as warned:
         sampler.sample(MotionPosterior(gaussian), draws=1, progress=False)
