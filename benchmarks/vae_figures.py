@@ -20,7 +20,7 @@ from probmotion.motion.distances import windows
 from probmotion.motion.motion import Motion
 
 NOISE = 0.01  # of keypoints of real motion, metres at the subject; as in training
-SEQUENCES = 100  # of real motion, whose codes are found
+SEQUENCES = 200  # of real motion, whose codes are drawn
 LENGTH, TURN = 0.03, 0.03  # deviations of log bone lengths and rotations (radians), given in 3D
 DESCENT = 150  # steps
 TO_Y_UP = np.array([1.0, -1.0, -1.0])
