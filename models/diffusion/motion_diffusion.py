@@ -96,7 +96,7 @@ class MotionDiffusion(TrackNetwork):
             source, KIND, DiffusionSettings
         )
         network = settings.network(skeleton.n_joints)
-        load_weights(network, checkpoint.tensors)
+        load_weights(network, checkpoint.tensors, KIND)
         data = (network, settings, standards, skeleton, fps)
         return cls(*data, frames=frames, device=device, card=checkpoint.settings)
 

@@ -185,13 +185,13 @@ class JointCorrector:
         ``FileNotFoundError`` for a missing file.
         """
         checkpoint = load_checkpoint(source, KIND)
-        with valid_settings(source, "corrector"):
+        with valid_settings(source, KIND):
             record = checkpoint.settings["network"]
             size = CorrectorSettings(**record["size"])
             skeleton = Skeleton(tuple(record["joint_names"]), tuple(record["parents"]))
             fps = float(record["fps"])
         network = CorrectorNetwork(size, skeleton)
-        load_weights(network, checkpoint.tensors)
+        load_weights(network, checkpoint.tensors, KIND)
         return cls(network, size, skeleton, fps, checkpoint.settings)
 
     def save(self, path: str | Path, *, half: bool = False) -> None:

@@ -63,14 +63,14 @@ class MotionDenoiser:
         """
         _check_kind(prior)
         checkpoint = load_checkpoint(source, KIND)
-        with valid_settings(source, "denoiser"):
+        with valid_settings(source, KIND):
             digest = checkpoint.settings["network"]["prior_weights"]
         if digest != (expected := weights_digest(prior.model)):
             raise CheckpointError(
                 f"{source} must be a denoiser of prior {expected[:8]}, got one of {digest[:8]}"
             )
         networks = DenoisingNetworks(prior)
-        load_weights(networks, checkpoint.tensors)
+        load_weights(networks, checkpoint.tensors, KIND)
         return cls(networks, prior, checkpoint.settings)
 
     def save(self, path: str | Path, *, half: bool = False) -> None:

@@ -120,14 +120,14 @@ class MotionDVAE(StandardNormalPrior):
         for a missing file.
         """
         checkpoint = load_checkpoint(source, KIND)
-        with valid_settings(source, "Motion-DVAE"):
+        with valid_settings(source, KIND):
             stored = checkpoint.settings["network"]
             settings = DVAESettings(**stored["size"])
             skeleton = Skeleton(stored["joint_names"], stored["parents"])
             states = BodyStates(skeleton, np.array(stored["rest"]))
             model = DVAEModel(settings, states.dim, skeleton.n_joints, stored["rank"])
             fps = stored["fps"]
-        load_weights(model, checkpoint.tensors)
+        load_weights(model, checkpoint.tensors, KIND)
         return cls(model, settings, states, fps, card=checkpoint.settings, **options)
 
     def save(self, path: str | Path, *, half: bool = False) -> None:

@@ -65,7 +65,7 @@ class TrackEvaluator(TrackNetwork):
             for name, tensor in checkpoint.tensors.items()
             if name.startswith(_ENCODER)
         }
-        load_weights(encoder, weights)
+        load_weights(encoder, weights, KIND)
         card = checkpoint.settings
         return cls(encoder, settings, standards, skeleton, fps, device=device, card=card)
 

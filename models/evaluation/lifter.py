@@ -186,7 +186,7 @@ class PoseLifter:
         skeleton = Skeleton(stored["joint_names"], stored["parents"])
         settings = LifterSettings(**stored["size"])
         network = LifterNetwork(settings, skeleton.n_joints, skeleton.roots[0])
-        load_weights(network, checkpoint.tensors)
+        load_weights(network, checkpoint.tensors, KIND)
         return cls(network, skeleton, device=device)
 
     def lift(self, views: np.ndarray) -> np.ndarray:

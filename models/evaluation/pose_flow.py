@@ -176,7 +176,7 @@ class PoseFlow(nn.Module):
         stored = checkpoint.settings["network"]
         skeleton = Skeleton(stored["joint_names"], stored["parents"])
         flow = cls(skeleton, FlowSettings(**stored["size"]), stored["components"])
-        load_weights(flow, checkpoint.tensors)
+        load_weights(flow, checkpoint.tensors, KIND)
         return flow.eval().requires_grad_(False)
 
     @property

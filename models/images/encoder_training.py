@@ -164,7 +164,7 @@ def load_encoder(path: str | Path, category: Category) -> EncoderNetwork:
     category.
     """
     checkpoint = load_checkpoint(path, KIND)
-    with valid_settings(path, "image encoder"):
+    with valid_settings(path, KIND):
         stored = checkpoint.settings["network"]
         network = EncoderNetwork(int(stored["dim"]))
     if stored.get("category") != category.digest:
@@ -172,5 +172,5 @@ def load_encoder(path: str | Path, category: Category) -> EncoderNetwork:
             f"encoder must be of the category {category.name}, got one of another; run "
             "probmotion train images again"
         )
-    load_weights(network, checkpoint.tensors)
+    load_weights(network, checkpoint.tensors, KIND)
     return network.eval().requires_grad_(False)

@@ -37,6 +37,19 @@ MODEL = "model.safetensors"
 WEIGHTS = Path(__file__).parents[1] / "weights"
 """Folder of the networks shipped with the package."""
 _FORMAT = 1  # version of the format
+_TRAIN = {
+    "motion-diffusion": "probmotion train diffusion",
+    "track-evaluator": "probmotion train evaluator",
+    "pose-flow": "probmotion train lifter",
+    "pose-lifter": "probmotion train lifter",
+    "motion-dvae": "probmotion train dvae",
+    "motion-denoiser": "probmotion train denoiser",
+    "motion-vae": "probmotion train motion-vae",
+    "motion-vae-poses": "probmotion train motion-vae",
+    "motion-vae-encoder": "probmotion train motion-vae",
+    "image-encoder": "probmotion train images",
+    "joint-corrector": "notebooks/ship_joint_corrector.py",
+}  # command that trains a kind of network
 _ENTRY = "probmotion"  # key of the header's metadata
 
 
@@ -123,6 +136,7 @@ def load_checkpoint(source: str | Path, kind: str) -> Checkpoint:
     if header["format"] != _FORMAT:
         raise CheckpointError(
             f"{path} must be a checkpoint of version {_FORMAT}, got version {header['format']}"
+            f"{_train_again(kind)}"
         )
     if header.get("kind") != kind:
         raise CheckpointError(f"{path} must contain a {kind}, got a {header.get('kind')}")
@@ -136,23 +150,26 @@ def load_checkpoint(source: str | Path, kind: str) -> Checkpoint:
 
 
 @contextmanager
-def valid_settings(source: str | Path, network: str) -> Iterator[None]:
+def valid_settings(source: str | Path, kind: str) -> Iterator[None]:
     """Convert errors due to missing or invalid settings of a network to ``CheckpointError``."""
     try:
         yield
     except (KeyError, OverflowError, TypeError, ValueError) as error:
         raise CheckpointError(
-            f"{source} must contain valid {network} settings, got an error: {error}"
+            f"{source} must contain valid {kind} settings, got an error: {error}"
+            f"{_train_again(kind)}"
         ) from error
 
 
-def load_weights(network: nn.Module, tensors: Mapping[str, torch.Tensor]) -> None:
+def load_weights(network: nn.Module, tensors: Mapping[str, torch.Tensor], kind: str) -> None:
     """Load tensors into a network; raise ``CheckpointError`` if names or shapes differ."""
     try:
         network.load_state_dict(dict(tensors))
     except RuntimeError as error:
         detail = " ".join(str(error).split("\n\t")[1:2])
-        raise CheckpointError(f"weights must match the checkpoint's settings: {detail}") from error
+        raise CheckpointError(
+            f"weights must match the checkpoint's settings, got {detail}{_train_again(kind)}"
+        ) from error
 
 
 def weights_digest(network: nn.Module) -> str:
@@ -162,6 +179,11 @@ def weights_digest(network: nn.Module) -> str:
         for name, tensor in network.state_dict().items()
     }
     return _digest({}, tensors)
+
+
+def _train_again(kind: str) -> str:
+    command = _TRAIN.get(kind)
+    return f"; files of other versions must be trained again: {command}" if command else ""
 
 
 def _find(source: str | Path, kind: str) -> Path:

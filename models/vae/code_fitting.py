@@ -143,7 +143,8 @@ class EncoderTrainee:
 
     def learnt(self, folder: str | Path) -> MotionVAEModel:
         """Return the networks with the encoder of a training run."""
-        load_weights(self.network.cpu(), load_checkpoint(folder, self.kind).tensors)
+        tensors = load_checkpoint(folder, self.kind).tensors
+        load_weights(self.network.cpu(), tensors, self.kind)
         model = copy.deepcopy(self._model)
         model.vae.time_encoder.load_state_dict(self.network.state_dict())
         return model

@@ -129,7 +129,7 @@ class MotionVAE(CodePrior):
         ``FileNotFoundError`` for a missing one.
         """
         checkpoint = load_checkpoint(source, KIND)
-        with valid_settings(source, "motion VAE"):
+        with valid_settings(source, KIND):
             stored = checkpoint.settings["network"]
             settings = MotionVAESettings(**stored["size"])
             skeleton = Skeleton(stored["joint_names"], stored["parents"])
@@ -138,9 +138,9 @@ class MotionVAE(CodePrior):
             fps = stored["fps"]
         tensors = dict(checkpoint.tensors)
         parts = [tensors.pop(f"codes.{name}") for name in _CODES if f"codes.{name}" in tensors]
-        load_weights(model, tensors)
+        load_weights(model, tensors, KIND)
         if parts:
-            with valid_settings(source, "code"):
+            with valid_settings(source, KIND):
                 stored = CodeMixture(*(values.double().numpy() for values in parts))
             options = {"codes": stored} | options
         card = checkpoint.settings

@@ -199,7 +199,7 @@ class PoseTrainee(_VAETrainee):
         network = self._fresh_network()
         checkpoint = load_checkpoint(folder, self.kind)
         check_same_run(checkpoint.settings, {"network": dict(self.settings)}, Path(folder))
-        load_weights(network, checkpoint.tensors)
+        load_weights(network, checkpoint.tensors, self.kind)
         return network
 
     def _loss(

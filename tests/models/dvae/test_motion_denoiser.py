@@ -336,7 +336,7 @@ def test_invalid_inputs_are_rejected(prior, make_prior, denoiser, tmp_path):
         MotionDenoiser.load(path, other)
     weights = denoiser.networks.state_dict()
     save_checkpoint(path, Checkpoint(KIND, {"network": {}}, weights))
-    with pytest.raises(CheckpointError, match="must contain valid denoiser settings"):
+    with pytest.raises(CheckpointError, match="must contain valid motion-denoiser settings"):
         MotionDenoiser.load(path, prior)
     with pytest.raises(ValueError, match="denoiser must have a training record to be saved"):
         MotionDenoiser(denoiser.networks, prior).save(path)

@@ -156,7 +156,7 @@ def test_checkpoint_round_trip(prior, tmp_path):
 def test_invalid_checkpoints_are_rejected(prior, tmp_path):
     path = tmp_path / "a.safetensors"
     weights, network = prior.model.state_dict(), prior.card["network"]
-    invalid = "must contain valid Motion-DVAE settings, got an error: "
+    invalid = "must contain valid motion-dvae settings, got an error: "
     for kind, settings, message in (
         ("evaluator", network, "must contain a motion-dvae, got a evaluator"),
         (KIND, network | {"size": network["size"] | {"hidden": 64}}, "weights must match the"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from contextlib import suppress
 from pathlib import Path
 
@@ -12,13 +13,18 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
+from probmotion.cli.main import main
+from probmotion.models.training import checkpoints
 from probmotion.models.training.checkpoints import (
+    WEIGHTS,
     Checkpoint,
     CheckpointError,
     load_checkpoint,
+    load_weights,
     save_checkpoint,
 )
 
+ROOT = Path(__file__).parents[3]
 KIND = "toy"
 RNG = np.random.default_rng(0)
 CHECKPOINT = Checkpoint(
@@ -130,3 +136,22 @@ def test_failed_writes_leave_the_previous_file(path, tmp_path, monkeypatch):
     assert [file.name for file in tmp_path.iterdir()] == ["a.safetensors"]
     with pytest.raises(OSError, match="nowhere"):
         save_checkpoint(tmp_path / "nowhere" / "a.safetensors", CHECKPOINT)
+
+
+def test_files_of_other_versions_name_the_command_that_trains_them_again(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main(["train", "--help"])
+    trained = re.findall(r"^  ([a-z-]+) ", capsys.readouterr().out, flags=re.MULTILINE)
+    shipped = {checkpoints._kind(file) for file in WEIGHTS.glob("*.safetensors")}
+    assert len(shipped) > 4
+    for kind in shipped:
+        path = tmp_path / "old.safetensors"
+        header = json.dumps({"format": 0, "kind": kind})
+        save_file({"a": torch.zeros(2)}, path, metadata={"probmotion": header})
+        with pytest.raises(CheckpointError, match=r"got version 0; .* trained again: ") as refused:
+            load_checkpoint(path, kind)
+        with pytest.raises(CheckpointError, match=r"got Missing key.* trained again: "):
+            load_weights(torch.nn.Linear(2, 2), {}, kind)
+        *_, command = str(refused.value).rpartition("again: ")
+        name = command.removeprefix("probmotion train ")
+        assert name in trained or (ROOT / command).is_file()

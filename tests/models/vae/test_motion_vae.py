@@ -250,7 +250,7 @@ def test_invalid_arguments_are_rejected(prior, tmp_path):
         with pytest.raises(ValueError, match=message):
             call()
     save_checkpoint(tmp_path / "b.safetensors", Checkpoint(KIND, {"network": {}}, {}))
-    with pytest.raises(CheckpointError, match="must contain valid motion VAE settings"):
+    with pytest.raises(CheckpointError, match="must contain valid motion-vae settings"):
         MotionVAE.load(tmp_path / "b.safetensors")
 
 

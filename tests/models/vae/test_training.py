@@ -147,8 +147,9 @@ def test_second_phase_learns_with_a_fixed_teacher(learnt, teacher):
 
 
 @pytest.mark.slow
-def test_short_training_yields_3d_walks(base, body, tmp_path):
-    given = base | {"size": MotionVAESettings.small()}
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_short_training_yields_3d_walks(base, body, tmp_path, seed):
+    given = base | {"size": MotionVAESettings.small(), "seed": seed}
     poses, vae, _ = usual_motion_vae_training("small")
     first = PoseTrainee(**given)
     train(first, replace(poses, steps=800), tmp_path / "poses", progress=False)
