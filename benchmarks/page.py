@@ -75,6 +75,7 @@ BENCHMARKS: dict[str, dict[str, str]] = {
     },
     "mas.py": {
         "outside_network_share": IN_NETWORK,
+        "outside_network_share_ddim": IN_NETWORK,
         "outside_network_share_second_order_sde": IN_NETWORK,
         "outside_network_share_heun": IN_NETWORK,
         "network_gflops_share": f"at least 0.7; {PRODUCTS}",

@@ -44,6 +44,5 @@ def test_codes_drawn_given_simulated_motion_vary_as_those_simulated(script):
     posed, image = script.filmed(prior, z, rng)
     truth = posed + prior.card["deviation"] * rng.standard_normal(posed.shape)
     drawn = script.codes_of(prior, truth, script.centred(prior, image), rng).numpy()
-    # Codes of the highest density have a fifth of the mean square.
     assert np.mean(drawn**2) == pytest.approx(np.mean(z**2), rel=0.15)
     assert np.corrcoef(drawn.ravel(), z.ravel())[0, 1] > 0.1
