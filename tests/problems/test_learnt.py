@@ -72,19 +72,20 @@ def test_shipped_files_and_held_out_clips(name, words):
 
 @pytest.mark.parametrize("name", DIFFUSION)
 def test_2d_draws_are_almost_as_close_to_held_out_clips_as_training_clips(name):
-    """The Fréchet distance is at most 1.5 times that of as many views of the training clips."""
+    """The Fréchet distance is at most 1.5 times theirs; that of draws at half the speed is not."""
     problem = load_problem(name)
     views = Ancestral2D().sample_views(problem.posterior, draws=128, seed=0, progress=False)
+    half = views.shape[1] // 2
     reference = problem.generation
-    ours, training, smeared = (
+    ours, training, slow = (
         frechet_distance(features, reference.held_out_features)
         for features in (
             reference.evaluator.features(views),
             reference.learnt_features[:128],
-            reference.evaluator.features(0.5 * (views + views[::-1])),
+            reference.evaluator.features(np.repeat(views[:, :half], 2, axis=1)),
         )
     )
-    assert ours < 1.5 * training < smeared
+    assert ours < 1.5 * training < slow
 
 
 def test_bones_are_rigid_with_correct_lengths(problem, draws):
