@@ -48,7 +48,7 @@ _TRAIN = {
     "motion-vae-poses": "probmotion train motion-vae",
     "motion-vae-encoder": "probmotion train motion-vae",
     "image-encoder": "probmotion train images",
-    "joint-corrector": "notebooks/ship_joint_corrector.py",
+    "joint-corrector": "python notebooks/ship_joint_corrector.py",
 }  # command that trains a kind of network
 _ENTRY = "probmotion"  # key of the header's metadata
 
@@ -133,13 +133,13 @@ def load_checkpoint(source: str | Path, kind: str) -> Checkpoint:
         raise CheckpointError(f"{path} is damaged or not a safetensors file: {error}") from error
     if not isinstance(header, dict) or "format" not in header:
         raise CheckpointError(f"{path} must be a checkpoint of probmotion, got no header")
+    if header.get("kind") != kind:
+        raise CheckpointError(f"{path} must contain a {kind}, got a {header.get('kind')}")
     if header["format"] != _FORMAT:
         raise CheckpointError(
             f"{path} must be a checkpoint of version {_FORMAT}, got version {header['format']}"
             f"{_train_again(kind)}"
         )
-    if header.get("kind") != kind:
-        raise CheckpointError(f"{path} must contain a {kind}, got a {header.get('kind')}")
     settings = header.get("settings", {})
     if header.get("sha256") != _digest(settings, tensors):
         raise CheckpointError(f"{path} is damaged: the checksum does not match")
@@ -168,7 +168,7 @@ def load_weights(network: nn.Module, tensors: Mapping[str, torch.Tensor], kind: 
     except RuntimeError as error:
         detail = " ".join(str(error).split("\n\t")[1:2])
         raise CheckpointError(
-            f"weights must match the checkpoint's settings, got {detail}{_train_again(kind)}"
+            f"weights must match the checkpoint's settings: {detail}{_train_again(kind)}"
         ) from error
 
 

@@ -383,7 +383,9 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="Synthetic walks and tiny networks.")
     parser.add_argument("--steps", type=int, help="Training steps of the second phase.")
     parser.add_argument("--draws", type=int, help="Generated sequences; default: 1400.")
-    parser.add_argument("--seed", type=int, default=0, help="Of tracks and training; default: 0.")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="Seed of tracks and training; default: 0."
+    )
     options = parser.parse_args()
     draws = options.draws or (60 if options.quick else 1400)
     given = options.out, options.data, options.quick, options.steps, draws, options.seed

@@ -89,8 +89,8 @@ def check_integrator(integrator: object, steps: int) -> None:
     check_object("integrator", integrator, AnyIntegrator)
     if isinstance(integrator, SecondOrderSDE) and steps < 3:
         raise ValueError(
-            "integrator SecondOrderSDE() requires estimates of two levels, and its first step has "
-            f"one: steps must be at least 3, got {steps}; otherwise use integrator=DDPM()"
+            f"steps must be at least 3 with integrator SecondOrderSDE(), got {steps}; use more "
+            "steps or integrator=DDPM()"
         )
 
 

@@ -65,7 +65,8 @@ class DDPM:
 class SecondOrderSDE:
     """SDE-DPM-Solver++ 2M (Lu et al. 2022): the DDPM step with an extrapolated estimate.
 
-    The first step, which has no previous estimate, is a DDPM step; samplers require a second.
+    The first step, which has no previous estimate, is a DDPM step; samplers require at least
+    three levels.
     """
 
     kind: str = field(default="second-order-sde", init=False)

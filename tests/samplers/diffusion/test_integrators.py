@@ -182,5 +182,5 @@ def test_levels_are_between_the_limits(levels):
 def test_a_second_order_step_requires_a_history(kind):
     kind(steps=3, levels=Cosine(), integrator=SecondOrderSDE())
     kind(steps=2, levels=Cosine(), integrator=DDPM())
-    with pytest.raises(ValueError, match=r"at least 3, got 2; .* integrator=DDPM\(\)"):
+    with pytest.raises(ValueError, match=r"steps must be at least 3 .*, got 2; .*DDPM\(\)"):
         kind(steps=2, levels=Cosine(), integrator=SecondOrderSDE())
