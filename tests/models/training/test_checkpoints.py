@@ -104,6 +104,7 @@ def test_other_files_are_rejected(path, tmp_path):
         header = json.loads(file.metadata()["probmotion"])
     for metadata, message in (
         (json.dumps(header | {"format": 99}), "checkpoint of version 1, got version 99"),
+        (json.dumps({"format": 99, "kind": "lifter"}), "must contain a toy, got a lifter"),
         (None, "must be a checkpoint of probmotion"),
         ("[1]", "must be a checkpoint of probmotion"),
     ):
