@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import array_api_compat
 import numpy as np
-from array_api_compat import array_namespace, device, is_jax_array, is_torch_array
+from array_api_compat import device, is_jax_array, is_torch_array
 
 __all__ = ["Array", "array_namespace", "constant", "jax_from_torch", "logsumexp", "to_numpy"]
 
@@ -14,8 +15,17 @@ Array = Any
 """An array of any library that follows the Python Array API standard."""
 
 
+def array_namespace(*arrays: Array) -> Any:
+    """Return the namespace of the arrays' library, which follows the Array API standard."""
+    if len(arrays) == 1 and isinstance(arrays[0], np.ndarray):
+        return np
+    return array_api_compat.array_namespace(*arrays)
+
+
 def constant(value: Any, like: Array) -> Array:
     """Return ``value`` as an array of the library, dtype and device of the float array ``like``."""
+    if isinstance(like, np.ndarray):
+        return np.asarray(value, dtype=like.dtype)
     xp = array_namespace(like)
     options = {} if is_jax_array(like) else {"device": device(like)}
     return xp.asarray(np.asarray(value), dtype=like.dtype, **options)

@@ -69,8 +69,8 @@ class MotionDiffusion(TrackNetwork):
                 f"{self.frames}"
             )
         super().__init__(network, settings, standards, skeleton, fps, **options)
-        self._mean = self._tensor(standards.mean / self.scale)
-        self._deviation = self._tensor(standards.deviation / self.scale)
+        self._mean = standards.mean / self.scale
+        self._deviation = standards.deviation / self.scale
 
     @classmethod
     def load(
@@ -153,12 +153,14 @@ class MotionDiffusion(TrackNetwork):
         self._check(x_t)
         if alpha_bar == 1:
             return x_t.copy()
-        network = self._network_at(alpha_bar)
+        standardised = (x_t - math.sqrt(alpha_bar) * self._mean) / self._spread(alpha_bar)
         clean = np.empty_like(x_t)
-        for rows, chunk in self._chunks(x_t):
+        for rows, motions, levels in self._chunks(standardised, alpha_bar):
             with inference(self._device):
-                denoised = network(chunk)
-            clean[rows] = _numbers(denoised, x_t)[: len(clean[rows])]
+                denoised = self._network(motions, levels)
+            clean[rows] = _numbers(denoised, clean[rows])
+        clean *= self._deviation
+        clean += self._mean
         return clean
 
     def view_covariance(
@@ -170,20 +172,25 @@ class MotionDiffusion(TrackNetwork):
         is only approximately symmetric.
         """
         self._check(x_t)
-        x_t = x_t.copy()
-        network = self._network_at(alpha_bar)
-        factor = (1 - alpha_bar) / math.sqrt(alpha_bar)
+        spread = self._spread(alpha_bar)
+        standardised = (x_t - math.sqrt(alpha_bar) * self._mean) / spread
+        factor = (1 - alpha_bar) / math.sqrt(alpha_bar) / spread
 
         def product(vectors: np.ndarray) -> np.ndarray:
             check_shape("vectors", vectors, x_t.shape)
             out = np.empty_like(vectors)
             # Evaluate the network again for each product: activations of all chunks are gigabytes.
-            chunks = zip(self._chunks(x_t), self._chunks(vectors), strict=True)
-            for (rows, chunk), (_, vector) in chunks:
+            chunks = zip(
+                self._chunks(standardised, alpha_bar),
+                self._chunks(self._deviation * vectors, alpha_bar),
+                strict=True,
+            )
+            for (rows, motions, levels), (_, vector, _) in chunks:
                 with torch.enable_grad():
-                    point = chunk.requires_grad_()
-                    (pulled,) = torch.autograd.grad(network(point), point, vector)
-                out[rows] = factor * _numbers(pulled, vectors)[: len(out[rows])]
+                    clean = self._network(motions.requires_grad_(), levels)
+                    (pulled,) = torch.autograd.grad(clean, motions, vector)
+                out[rows] = _numbers(pulled, out[rows])
+            out *= factor
             return out
 
         return product
@@ -216,38 +223,32 @@ class MotionDiffusion(TrackNetwork):
                 f"x_t must have at most {self.settings.frames} frames, got {x_t.shape[2]}"
             )
 
-    def _network_at(self, alpha_bar: float) -> Callable[[torch.Tensor], torch.Tensor]:
-        """Return the map from noisy to clean motions (N, L, J, 2) at a noise level."""
-        level, signal = self.settings.level(alpha_bar), math.sqrt(alpha_bar)
-        mean, deviation = self._mean, self._deviation
-        spread = torch.sqrt(alpha_bar * deviation**2 + (1 - alpha_bar))
+    def _spread(self, alpha_bar: float) -> np.ndarray:
+        """Return the standard deviations of noisy views (J, 2) at a noise level."""
+        return np.sqrt(alpha_bar * self._deviation**2 + (1 - alpha_bar))
 
-        def denoise(noisy: torch.Tensor) -> torch.Tensor:
-            standardised = (noisy - signal * mean) / spread
-            levels = torch.full((len(noisy),), level, device=self._device)
-            clean = self._network(standardised.flatten(2), levels).unflatten(2, (-1, 2))
-            return mean + deviation * clean
-
-        return denoise
-
-    def _chunks(self, views: np.ndarray) -> Iterator[tuple[slice, torch.Tensor]]:
-        """Yield slices of n motions, each with all their views as one batch (n V, L, J, 2)."""
+    def _chunks(
+        self, views: np.ndarray, alpha_bar: float
+    ) -> Iterator[tuple[slice, torch.Tensor, torch.Tensor]]:
+        """Yield slices of n motions, with all their views (n V, L, 2 J) and noise levels (n V,)."""
         B, V, L = views.shape[:3]
         cpu = self._device == "cpu"
         n = max(1, batch_tokens(self._device, _TOKENS) // (V * (L + 1)))
         if cpu:
             n = 1 if n < 4 else 1 << (n.bit_length() - 1)
+        level = self.settings.level(alpha_bar)
         for start in range(0, B, n):
             chunk = views[start : start + n]
             rows = slice(start, start + len(chunk))
             if cpu and len(chunk) < n:
                 chunk = np.concatenate([chunk, np.zeros((n - len(chunk), *chunk.shape[1:]))])
-            yield rows, self._tensor(chunk).flatten(0, 1)
+            motions = self._tensor(chunk.reshape(len(chunk) * V, L, -1))
+            yield rows, motions, self._tensor(np.full(len(motions), level))
 
     def _tensor(self, values: np.ndarray) -> torch.Tensor:
-        return torch.as_tensor(values, dtype=torch.float32, device=self._device)
+        return torch.from_numpy(values.astype(np.float32)).to(self._device)
 
 
 def _numbers(views: torch.Tensor, like: np.ndarray) -> np.ndarray:
-    """Return a batch of views as an array (n, V, L, J, 2) in the precision of ``like``."""
-    return views.unflatten(0, (-1, like.shape[1])).cpu().numpy().astype(like.dtype)
+    """Return the first views of a chunk as an array of the shape of ``like``."""
+    return views.cpu().numpy().reshape(-1, *like.shape[1:])[: len(like)]

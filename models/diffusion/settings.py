@@ -118,15 +118,19 @@ class DiffusionSettings(TransformerSettings):
         """
         if not 0 < alpha_bar <= 1:
             raise ValueError(f"alpha_bar must be above 0 and at most 1, got {alpha_bar:.3g}")
-        levels = self.schedule.alpha_bar
-        # Level 0 has no noise; use a hundredth of the first level's to avoid log 0.
-        noise = np.sqrt((1 - levels) / levels)
-        noise[0] = 0.01 * noise[1]
-        if alpha_bar < levels[-1] * (1 - 1e-9):
+        noise, log_noise = math.sqrt((1 - alpha_bar) / alpha_bar), self._log_noise
+        if alpha_bar < self.schedule.alpha_bar[-1] * (1 - 1e-9):
             raise ValueError(
-                f"noise levels must be at most {noise[-1]:.3g}, the network's last, got "
-                f"{math.sqrt((1 - alpha_bar) / alpha_bar):.3g}; use levels="
-                f"Cosine(trained_steps={self.steps}) or Karras()"
+                f"noise levels must be at most {math.exp(log_noise[-1]):.3g}, the network's last, "
+                f"got {noise:.3g}; use levels=Cosine(trained_steps={self.steps}) or Karras()"
             )
-        here = max(math.sqrt((1 - alpha_bar) / alpha_bar), noise[0])
-        return float(np.interp(math.log(here), np.log(noise), np.arange(len(levels))))
+        # np.interp returns 0 below the first entry.
+        here = math.log(noise) if noise > 0 else -math.inf
+        return float(np.interp(here, log_noise, np.arange(len(log_noise))))
+
+    @cached_property
+    def _log_noise(self) -> np.ndarray:
+        """Log noise of every level; that of level 0, without noise, is a hundredth of level 1's."""
+        sigma = np.array([self.schedule.sigma(t) for t in range(self.steps + 1)])
+        sigma[0] = 0.01 * sigma[1]
+        return np.log(sigma)

@@ -18,7 +18,7 @@ from probmotion.geometry.cameras import Cameras
 from probmotion.models.mixture.gaussian_mixture import GaussianMixtureMotion
 from probmotion.models.mixture.posterior import MixturePosterior
 from probmotion.models.mixture.rotated_mixture import rotation_coefficients
-from probmotion.posteriors.protocols import Likelihood, NotConjugate
+from probmotion.posteriors.protocols import Likelihood, NotConjugate, OrthographicOnly
 from probmotion.validation import check_shape
 
 __all__ = ["ConditionedMixture"]
@@ -79,7 +79,7 @@ class ConditionedMixture:
     def denoise(self, x_t: np.ndarray, alpha_bar: float, cameras: Cameras) -> np.ndarray:
         """Return E[x₀ | x_t, y] for each orthographic view, (B, V, L, J, 2), normalised units."""
         if not cameras.orthographic:
-            raise ValueError("cameras must be orthographic, got perspective")
+            raise OrthographicOnly("cameras must be orthographic, got perspective")
         check_shape("x_t", x_t, ("B", cameras.n_views, *self.prior.means.shape[1:3], 2))
         out = np.empty_like(x_t)
         for view, axes in enumerate(cameras.image_axes):

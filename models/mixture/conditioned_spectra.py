@@ -13,7 +13,7 @@ import numpy as np
 from probmotion.arrays import Array
 from probmotion.geometry.cameras import Cameras
 from probmotion.models.mixture.spectral_posterior import SpectralPosterior, condition
-from probmotion.posteriors.protocols import Likelihood, MotionPrior, NotConjugate
+from probmotion.posteriors.protocols import Likelihood, MotionPrior, NotConjugate, OrthographicOnly
 from probmotion.validation import check_shape
 
 __all__ = ["ConditionedSpectra"]
@@ -68,7 +68,7 @@ class ConditionedSpectra:
     def denoise(self, x_t: np.ndarray, alpha_bar: float, cameras: Cameras) -> np.ndarray:
         """Return E[x₀ | x_t, y] for each orthographic view, (B, V, L, J, 2), normalised units."""
         if not cameras.orthographic:
-            raise ValueError("cameras must be orthographic, got perspective")
+            raise OrthographicOnly("cameras must be orthographic, got perspective")
         check_shape("x_t", x_t, ("B", cameras.n_views, self.frames, self.skeleton.n_joints, 2))
         views = [
             self._mean(x_t[:, view], alpha_bar, axes) @ axes.T

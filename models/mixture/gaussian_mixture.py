@@ -22,7 +22,7 @@ from probmotion.models.mixture.posterior import MixturePosterior
 from probmotion.models.mixture.rotated_mixture import RotatedMixture, rotation_fields
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
-from probmotion.posteriors.protocols import Likelihood
+from probmotion.posteriors.protocols import Likelihood, OrthographicOnly
 from probmotion.seeds import RandomNumbers
 from probmotion.validation import check_count, check_finite, check_positive, check_shape
 
@@ -380,7 +380,7 @@ class GaussianMixtureMotion:
     def _view_mixtures(self, cameras: Cameras, x_t: np.ndarray) -> list[RotatedMixture]:
         """Return the 2D marginals of the V views, which are mixtures with the same weights."""
         if not cameras.orthographic:
-            raise ValueError("cameras must be orthographic, got perspective")
+            raise OrthographicOnly("cameras must be orthographic, got perspective")
         check_shape("x_t", x_t, ("B", cameras.n_views, *self.means.shape[1:3], 2))
         for axes in cameras.image_axes:
             if axes.tobytes() not in self._views:

@@ -39,7 +39,7 @@ from probmotion.models.mixture.spectrum import (
 from probmotion.models.mixture.view_spectra import ViewSpectra
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
-from probmotion.posteriors.protocols import Likelihood
+from probmotion.posteriors.protocols import Likelihood, OrthographicOnly
 from probmotion.validation import check_count, check_finite, check_positive, check_shape
 
 __all__ = ["SpectralMixtureMotion"]
@@ -490,7 +490,7 @@ class SpectralMixtureMotion:
     def _view_mixtures(self, cameras: Cameras, x_t: np.ndarray) -> list[ViewSpectra]:
         """Return the 2D marginals of the V views, which are mixtures with the same weights."""
         if not cameras.orthographic:
-            raise ValueError("cameras must be orthographic, got perspective")
+            raise OrthographicOnly("cameras must be orthographic, got perspective")
         check_shape("x_t", x_t, ("B", cameras.n_views, *self._means.shape[1:3], 2))
         mixtures = []
         for axes in cameras.image_axes:

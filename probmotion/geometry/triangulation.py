@@ -94,7 +94,6 @@ def triangulate(
         weight = _views_first(weights[..., None])[0, ...]
         seen = xp.where(weight > 0, seen, xp.zeros_like(seen))
     equations = _equations(cameras, keypoints)
-    ones = xp.ones_like(seen[0, :1, :])
     # Singular equations divide by 0 here and are reported below.
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         if cameras.orthographic or initial is None:
@@ -105,16 +104,14 @@ def triangulate(
             points = xp.permute_dims(xp.reshape(initial, (-1, 3)), (1, 0))
         inverse_depth = None
         for iteration in range(0 if cameras.orthographic else iterations):
-            x, y, z = points[0, :], points[1, :], points[2, :]
-            image = equations.projection @ xp.stack([x, y, z, ones[0, :]])
+            image = equations.projection[:, :3] @ points + equations.projection[:, 3:]
             inverse_depth = 1 / image[2 * V :, :]
             image = xp.reshape(image[: 2 * V, :], seen.shape) * inverse_depth
             if iteration == 0:
                 normal = _normal(xp, equations, inverse_depth, image, weight)
                 factors = _factor(normal)
             pull = _pull(xp, equations, (seen - image) * inverse_depth, image, weight)
-            dx, dy, dz = _solve(factors, pull)
-            points = xp.stack([x + dx, y + dy, z + dz])
+            points = points + xp.stack(_solve(factors, pull))
         if not type(points).__name__.endswith("Tracer"):
             _check_solution(xp, keypoints, weights, shape, points, normal, factors, inverse_depth)
     return xp.reshape(xp.permute_dims(points, (1, 0)), (*shape, 3))

@@ -96,11 +96,11 @@ class NoiseSchedule:
         """
         if not 1 <= t <= self.steps:
             raise ValueError(f"t must be between 1 and {self.steps}, got {t}")
-        bar_t, bar_s = self.alpha_bar[t], self.alpha_bar[t - 1]
+        bar_t, bar_s = float(self.alpha_bar[t]), float(self.alpha_bar[t - 1])
         alpha = bar_t / bar_s
         beta = 1 - alpha
         return PosteriorStep(
-            clean=float(np.sqrt(bar_s) * beta / (1 - bar_t)),
-            noisy=float(np.sqrt(alpha) * (1 - bar_s) / (1 - bar_t)),
-            deviation=float(np.sqrt(beta * (1 - bar_s) / (1 - bar_t))),
+            clean=math.sqrt(bar_s) * beta / (1 - bar_t),
+            noisy=math.sqrt(alpha) * (1 - bar_s) / (1 - bar_t),
+            deviation=math.sqrt(beta * (1 - bar_s) / (1 - bar_t)),
         )

@@ -39,6 +39,7 @@ __all__ = [
     "MotionInference",
     "MotionPrior",
     "NotConjugate",
+    "OrthographicOnly",
     "Samplable",
     "Walks",
 ]
@@ -46,6 +47,10 @@ __all__ = [
 
 class NotConjugate(ValueError):  # noqa: N818 (a condition, not a fault)
     """Error for a posterior without closed form; the message is the reason."""
+
+
+class OrthographicOnly(ValueError):  # noqa: N818 (a condition, not a fault)
+    """Error for perspective cameras where only orthographic views are supported."""
 
 
 @runtime_checkable
@@ -265,6 +270,11 @@ class Denoises2D(Protocol):
             ᾱ, in (0, 1].
         cameras : Cameras
             The V views. The exact prior uses their elevation; trained networks ignore them.
+
+        Raises
+        ------
+        OrthographicOnly
+            If the cameras are perspective and the denoiser does not support them.
         """
 
 

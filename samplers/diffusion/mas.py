@@ -145,9 +145,8 @@ class MultiViewAncestral(AncestralSampler):
         prior = posterior.prior
         assert isinstance(prior, Denoises2D)
         shape = (posterior.frames, posterior.skeleton.n_joints, 3)
-        views = Views(self.cameras, self.view_weights)
         if self.shared_noise and not self.perspective:
-            denoiser = MultiViewDenoiser(prior, views)
+            denoiser = MultiViewDenoiser(prior, Views(self.cameras, self.view_weights))
             guide = guide_towards(self, posterior, self.guidance, denoiser)
             return MotionState([denoiser], self.schedule, shape, [guide])
         if posterior.likelihood is not None:
@@ -157,7 +156,9 @@ class MultiViewAncestral(AncestralSampler):
                 f"perspective={self.perspective} and shared_noise={self.shared_noise}",
                 word="observations",
             )
-        return SeparateViews(prior, self.cameras, views, self.schedule, shape, self.shared_noise)
+        return SeparateViews(
+            prior, self.cameras, self.view_weights, self.schedule, shape, self.shared_noise
+        )
 
 
 @dataclass(frozen=True, eq=False)

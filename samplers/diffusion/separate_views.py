@@ -9,7 +9,7 @@ import numpy as np
 from probmotion.geometry.cameras import Cameras
 from probmotion.geometry.triangulation import triangulate
 from probmotion.posteriors.noise_schedule import NoiseSchedule
-from probmotion.posteriors.protocols import Denoises2D
+from probmotion.posteriors.protocols import Denoises2D, OrthographicOnly
 from probmotion.posteriors.sampling import UnsupportedPosterior
 from probmotion.samplers.diffusion.views import Views
 from probmotion.seeds import NormalStreams
@@ -22,16 +22,23 @@ class SeparateViews:
     """State with V noisy views per draw, (B, V, L, J, 2); ``shape`` is (L, J, 3).
 
     All arrays are in normalised units. Shared noise is projected orthographically to ``views``.
+    ``weights`` are those of the views, equal by default.
     """
 
     prior: Denoises2D
     cameras: Cameras
-    views: Views
+    weights: tuple[float, ...] | None
     schedule: NoiseSchedule
     shape: tuple[int, ...]
     shared_noise: bool
     counts: dict[str, int] = field(default_factory=lambda: {"denoiser": 0})
-    _last: np.ndarray | None = None  # Previous triangulation, the next initial value.
+    views: Views = field(init=False)
+    _normalised: Cameras = field(init=False)  # The cameras in normalised units.
+    _last: np.ndarray | None = field(default=None, init=False)  # Previous triangulation.
+
+    def __post_init__(self) -> None:
+        self.views = Views(self.cameras, self.weights)
+        self._normalised = self.cameras.scaled(1 / self.prior.scale)
 
     def noise(self, streams: NormalStreams, t: int) -> np.ndarray:
         """Return unit noise in every view; level T starts a new batch."""
@@ -47,24 +54,20 @@ class SeparateViews:
         clean = self._denoise(x_t, float(self.schedule.alpha_bar[t]))
         if self.cameras.orthographic:
             return self.views.combine(clean)
-        scale = self.prior.scale
-        motions = triangulate(clean * scale, self.cameras, self.views.weights, initial=self._last)
-        self._last = motions
-        return motions / scale
+        weights = None if self.weights is None else np.asarray(self.weights)
+        self._last = triangulate(clean, self._normalised, weights, initial=self._last)
+        return self._last
 
     def embed(self, motions: np.ndarray) -> np.ndarray:
         """Return the projections of clean motions, (B, V, L, J, 2)."""
         if self.cameras.orthographic:
             return self.views.project(motions)
-        scale = self.prior.scale
-        return self.cameras.project(motions * scale) / scale
+        return self._normalised.project(motions)
 
     def _denoise(self, x_t: np.ndarray, alpha_bar: float) -> np.ndarray:
         try:
             return self.prior.denoise(x_t, alpha_bar, self.cameras)
-        except ValueError as error:
-            if self.cameras.orthographic:
-                raise
+        except OrthographicOnly as error:
             raise UnsupportedPosterior(
                 "mas",
                 "with perspective views needs a denoiser that supports them, but "

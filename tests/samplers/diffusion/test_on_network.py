@@ -162,12 +162,18 @@ SAMPLERS = [
 ]
 
 
-@pytest.mark.parametrize("sampler", [*SAMPLERS, SplitGibbs(steps=10, sweeps=2)])
+@pytest.mark.parametrize("sampler", [*SAMPLERS, SplitGibbs(4, 2, 4, start_steps=8, particles=3)])
 def test_draws_are_bit_identical_for_any_batch(prior, sampler):
     likelihood = OBSERVED if isinstance(sampler, SplitGibbs) else None
     motions = draw(sampler, prior, likelihood, draws=13)
     batched = draw(replace(sampler, batch=5), prior, likelihood, draws=13)
     np.testing.assert_array_equal(batched, motions)
+
+
+@pytest.mark.parametrize("perspective", [False, True])
+def test_levels_above_the_trained_range_are_refused(prior, perspective):
+    with pytest.raises(ValueError, match=r"^noise levels must be at most .*; use levels=Cosine"):
+        draw(MultiViewAncestral(steps=101, perspective=perspective), prior, draws=1)
 
 
 def test_short_motions(prior):

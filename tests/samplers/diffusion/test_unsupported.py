@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from probmotion import Cameras, Joints3D, Keypoints2D, MotionPosterior, UnsupportedPosterior
+from probmotion.posteriors.protocols import OrthographicOnly
 from probmotion.samplers import (
     Ancestral3D,
     MultiViewAncestral,
@@ -57,7 +58,7 @@ def test_samplers_without_guidance_refuse_observations(gaussian):
 def test_perspective_views_need_a_denoiser_that_supports_them(gaussian, gaussian_motion):
     class Orthographic(gaussian_motion):
         def denoise(self, x_t, alpha_bar, cameras):
-            raise ValueError("cameras must be orthographic")
+            raise OrthographicOnly("cameras must be orthographic")
 
     posterior = MotionPosterior(Orthographic(gaussian.mean, gaussian.covariance))
     with pytest.raises(UnsupportedPosterior, match="Orthographic raised: cameras must be ortho"):
