@@ -246,8 +246,8 @@ animate_skeletons({"three draws": motions}, category.body.skeleton, fps=moving.f
 # ## 7. When not to trust it
 #
 # Checks compare the most probable body with the mask, and its shape with those of the category: no animal has the
-# silhouette of a star, and only an unusually thick one that of a square. They do not see more than that. A failed check
-# is a reason to look, and a passed one is no proof.
+# silhouette of a star or of a square. They do not see more than that. A failed check is a reason to look, and a passed
+# one is no proof.
 
 # %%
 rows, columns = np.mgrid[:96, :96] - 47.5

@@ -243,5 +243,5 @@ def test_from_one_image(tmp_path, monkeypatch):
     )
     assert all(a < d for a, d in zip(across, depth, strict=True))
     assert {path.suffix for path in (tmp_path / "animal").iterdir()} >= {".glb", ".html", ".npz"}
-    assert printed.count("a star: Do not trust this reconstruction") == 1
-    assert printed.count("a square: A body") == 1
+    for shape in ("star", "square"):
+        assert printed.count(f"a {shape}: Do not trust this reconstruction") == 1
