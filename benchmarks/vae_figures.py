@@ -11,7 +11,7 @@ from scipy.stats import kstest
 
 from probmotion import seeds
 from probmotion.data.projections import Filming, centre_motion
-from probmotion.data.synthetic.animals import animal_clips
+from probmotion.data.synthetic.animals import VARIED_TRUNKS, animal_clips
 from probmotion.data.synthetic.walks import walk_clips
 from probmotion.geometry.rotations import vector_to_matrix
 from probmotion.models.vae.losses import best_hypothesis, predicted_hypotheses, project_to_image
@@ -39,7 +39,7 @@ def vae_figures(folder: Path) -> Iterator[tuple[str, float]]:
     """
     for name, label, clips in (
         ("walk-vae", "people", walk_clips(folder)["test"]),
-        ("animal-vae", "animals", animal_clips(folder)["test"]),
+        ("animal-vae", "animals", animal_clips(folder, trunks=VARIED_TRUNKS)["test"]),
     ):
         prior = MotionVAE.load(name)
         real = real_windows(prior, clips)

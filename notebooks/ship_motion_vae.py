@@ -17,13 +17,14 @@ import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from ship_diffusion import write_features
 
 from probmotion.data.projections import Filming, centre_motion
-from probmotion.data.synthetic.animals import ANIMAL_SKELETON, animal_clips
+from probmotion.data.synthetic.animals import ANIMAL_SKELETON, VARIED_TRUNKS, animal_clips
 from probmotion.data.synthetic.walks import walk_clips
 from probmotion.data.tracks.learning import certain, film_clips
 from probmotion.files import written_whole
@@ -80,13 +81,13 @@ KINDS = {
     "animal-vae": Kind(
         "Four-legged animals that walk, trot, pace, canter and spin",
         ANIMAL_SKELETON,
-        animal_clips,
+        partial(animal_clips, trunks=VARIED_TRUNKS),
         {"quadruped": 16, "dog3d": 128},
         0.001,
         2500,
         "dog3d_*: xbpeng/DeepMimic, MIT licence, © 2018 Xue Bin Peng; they resemble dog motion "
         "capture that its authors offer for non-commercial use only, which may apply here too. "
-        "quadruped-*: synthetic clips of this project.",
+        "quadruped-*: synthetic clips of this project, with trunks of varied lengths.",
     ),
 }
 

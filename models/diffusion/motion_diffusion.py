@@ -69,8 +69,8 @@ class MotionDiffusion(TrackNetwork):
                 f"{self.frames}"
             )
         super().__init__(network, settings, standards, skeleton, fps, **options)
-        self._mean = standards.mean / self.scale
-        self._deviation = standards.deviation / self.scale
+        self._mean = (standards.mean / self.scale).astype(np.float32)
+        self._deviation = (standards.deviation / self.scale).astype(np.float32)
 
     @classmethod
     def load(
@@ -153,15 +153,16 @@ class MotionDiffusion(TrackNetwork):
         self._check(x_t)
         if alpha_bar == 1:
             return x_t.copy()
-        standardised = (x_t - math.sqrt(alpha_bar) * self._mean) / self._spread(alpha_bar)
-        clean = np.empty_like(x_t)
-        for rows, motions, levels in self._chunks(standardised, alpha_bar):
+        level = self.settings.level(alpha_bar)
+        standardised = self._standardised(x_t, alpha_bar)
+        clean = np.empty_like(standardised)
+        for rows, motions, levels in self._chunks(standardised, level):
             with inference(self._device):
                 denoised = self._network(motions, levels)
             clean[rows] = _numbers(denoised, clean[rows])
         clean *= self._deviation
         clean += self._mean
-        return clean
+        return clean.astype(x_t.dtype)
 
     def view_covariance(
         self, x_t: np.ndarray, alpha_bar: float, cameras: Cameras
@@ -172,17 +173,17 @@ class MotionDiffusion(TrackNetwork):
         is only approximately symmetric.
         """
         self._check(x_t)
-        spread = self._spread(alpha_bar)
-        standardised = (x_t - math.sqrt(alpha_bar) * self._mean) / spread
-        factor = (1 - alpha_bar) / math.sqrt(alpha_bar) / spread
+        level = self.settings.level(alpha_bar)
+        standardised = self._standardised(x_t, alpha_bar)
+        factor = (1 - alpha_bar) / math.sqrt(alpha_bar) / self._spread(alpha_bar)
 
         def product(vectors: np.ndarray) -> np.ndarray:
             check_shape("vectors", vectors, x_t.shape)
-            out = np.empty_like(vectors)
+            out = np.empty_like(standardised)
             # Evaluate the network again for each product: activations of all chunks are gigabytes.
             chunks = zip(
-                self._chunks(standardised, alpha_bar),
-                self._chunks(self._deviation * vectors, alpha_bar),
+                self._chunks(standardised, level),
+                self._chunks(self._deviation * vectors.astype(np.float32), level),
                 strict=True,
             )
             for (rows, motions, levels), (_, vector, _) in chunks:
@@ -190,8 +191,7 @@ class MotionDiffusion(TrackNetwork):
                     clean = self._network(motions.requires_grad_(), levels)
                     (pulled,) = torch.autograd.grad(clean, motions, vector)
                 out[rows] = _numbers(pulled, out[rows])
-            out *= factor
-            return out
+            return (factor * out).astype(vectors.dtype)
 
         return product
 
@@ -225,10 +225,16 @@ class MotionDiffusion(TrackNetwork):
 
     def _spread(self, alpha_bar: float) -> np.ndarray:
         """Return the standard deviations of noisy views (J, 2) at a noise level."""
+        alpha_bar = float(alpha_bar)  # NumPy's scalars would not keep single precision
         return np.sqrt(alpha_bar * self._deviation**2 + (1 - alpha_bar))
 
+    def _standardised(self, x_t: np.ndarray, alpha_bar: float) -> np.ndarray:
+        """Return the network's input, in single precision."""
+        shift = math.sqrt(alpha_bar) * self._mean
+        return (x_t.astype(np.float32) - shift) / self._spread(alpha_bar)
+
     def _chunks(
-        self, views: np.ndarray, alpha_bar: float
+        self, views: np.ndarray, level: float
     ) -> Iterator[tuple[slice, torch.Tensor, torch.Tensor]]:
         """Yield slices of n motions, with all their views (n V, L, 2 J) and noise levels (n V,)."""
         B, V, L = views.shape[:3]
@@ -236,19 +242,21 @@ class MotionDiffusion(TrackNetwork):
         n = max(1, batch_tokens(self._device, _TOKENS) // (V * (L + 1)))
         if cpu:
             n = 1 if n < 4 else 1 << (n.bit_length() - 1)
-        level = self.settings.level(alpha_bar)
         for start in range(0, B, n):
             chunk = views[start : start + n]
             rows = slice(start, start + len(chunk))
             if cpu and len(chunk) < n:
-                chunk = np.concatenate([chunk, np.zeros((n - len(chunk), *chunk.shape[1:]))])
+                chunk = np.pad(chunk, [(0, n - len(chunk)), *[(0, 0)] * (chunk.ndim - 1)])
             motions = self._tensor(chunk.reshape(len(chunk) * V, L, -1))
-            yield rows, motions, self._tensor(np.full(len(motions), level))
+            yield rows, motions, self._tensor(np.full(len(motions), level, np.float32))
 
     def _tensor(self, values: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(values.astype(np.float32)).to(self._device)
+        return torch.from_numpy(values).to(self._device)
 
 
 def _numbers(views: torch.Tensor, like: np.ndarray) -> np.ndarray:
-    """Return the first views of a chunk as an array of the shape of ``like``."""
+    """Return the outputs of the first motions of a chunk, in the shape of ``like``.
+
+    The others are padding.
+    """
     return views.cpu().numpy().reshape(-1, *like.shape[1:])[: len(like)]

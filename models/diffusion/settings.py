@@ -121,16 +121,17 @@ class DiffusionSettings(TransformerSettings):
         noise, log_noise = math.sqrt((1 - alpha_bar) / alpha_bar), self._log_noise
         if alpha_bar < self.schedule.alpha_bar[-1] * (1 - 1e-9):
             raise ValueError(
-                f"noise levels must be at most {math.exp(log_noise[-1]):.3g}, the network's last, "
-                f"got {noise:.3g}; use levels=Cosine(trained_steps={self.steps}) or Karras()"
+                f"noise levels must be at most {self.schedule.sigma(self.steps):.3g}, the "
+                f"network's last, got {noise:.3g}; use levels=Cosine(trained_steps={self.steps}) "
+                "or Karras()"
             )
-        # np.interp returns 0 below the first entry.
+        # Below the first entry, np.interp returns level 0.
         here = math.log(noise) if noise > 0 else -math.inf
         return float(np.interp(here, log_noise, np.arange(len(log_noise))))
 
     @cached_property
     def _log_noise(self) -> np.ndarray:
-        """Log noise of every level; that of level 0, without noise, is a hundredth of level 1's."""
+        """Log noise levels log σ. Level 0 has no noise; σ₀ is set to σ₁/100."""
         sigma = np.array([self.schedule.sigma(t) for t in range(self.steps + 1)])
         sigma[0] = 0.01 * sigma[1]
         return np.log(sigma)

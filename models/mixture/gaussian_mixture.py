@@ -261,7 +261,7 @@ class GaussianMixtureMotion:
 
         Raises
         ------
-        ValueError
+        OrthographicOnly
             If a camera is perspective, as its marginals are not Gaussian mixtures.
         """
         out = np.empty_like(x_t)

@@ -334,7 +334,7 @@ class SpectralMixtureMotion:
 
         Raises
         ------
-        ValueError
+        OrthographicOnly
             If a camera is perspective, as its marginals are not Gaussian mixtures.
         """
         out = np.empty_like(x_t)

@@ -1,8 +1,8 @@
 """Devices and precision of networks.
 
 Random numbers are drawn on the CPU, so that they do not depend on the device; only dropout draws on
-the device. Weights, inputs and outputs are in single precision on every device. Training on CUDA
-computes matrix products in bfloat16.
+the device. Weights, inputs and outputs of networks are in single precision on every device.
+Training on CUDA computes matrix products in bfloat16.
 """
 
 from __future__ import annotations

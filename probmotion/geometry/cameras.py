@@ -182,17 +182,6 @@ class Cameras:
         focal = self.focal / self.translation[:, 2]
         return Cameras(self.rotation, self.translation, focal, self.centre, orthographic=True)
 
-    def scaled(self, factor: float) -> Cameras:
-        """Return cameras of a scene scaled about the world origin; images are scaled likewise.
-
-        ``scaled(c).project(c * points)`` equals ``c * project(points)``.
-        """
-        assert self.centre is not None
-        check_positive("factor", factor)
-        focal = self.focal if self.orthographic else factor * self.focal
-        translation, centre = factor * self.translation, factor * self.centre
-        return Cameras(self.rotation, translation, focal, centre, self.orthographic)
-
     def depth(self, points: Array) -> Array:
         """Return depths along the cameras' z axes: ``(…, L, J, 3) → (…, V, L, J)``, metres."""
         xp = array_namespace(points)

@@ -26,6 +26,7 @@ from .protocols import (
     MotionInference as MotionInference,
     MotionPrior as MotionPrior,
     NotConjugate as NotConjugate,
+    OrthographicOnly as OrthographicOnly,
     Samplable as Samplable,
 )
 from .reference import StoredReference as StoredReference

@@ -22,7 +22,7 @@ class SeparateViews:
     """State with V noisy views per draw, (B, V, L, J, 2); ``shape`` is (L, J, 3).
 
     All arrays are in normalised units. Shared noise is projected orthographically to ``views``.
-    ``weights`` are those of the views, equal by default.
+    ``weights`` w_v of the views; 1 by default.
     """
 
     prior: Denoises2D
@@ -33,12 +33,11 @@ class SeparateViews:
     shared_noise: bool
     counts: dict[str, int] = field(default_factory=lambda: {"denoiser": 0})
     views: Views = field(init=False)
-    _normalised: Cameras = field(init=False)  # The cameras in normalised units.
-    _last: np.ndarray | None = field(default=None, init=False)  # Previous triangulation.
+    # Previous triangulation, metres: the initial value of the next, which it makes faster.
+    _last: np.ndarray | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         self.views = Views(self.cameras, self.weights)
-        self._normalised = self.cameras.scaled(1 / self.prior.scale)
 
     def noise(self, streams: NormalStreams, t: int) -> np.ndarray:
         """Return unit noise in every view; level T starts a new batch."""
@@ -54,15 +53,16 @@ class SeparateViews:
         clean = self._denoise(x_t, float(self.schedule.alpha_bar[t]))
         if self.cameras.orthographic:
             return self.views.combine(clean)
-        weights = None if self.weights is None else np.asarray(self.weights)
-        self._last = triangulate(clean, self._normalised, weights, initial=self._last)
-        return self._last
+        scale = self.prior.scale
+        self._last = triangulate(clean * scale, self.cameras, self.weights, initial=self._last)
+        return self._last / scale
 
     def embed(self, motions: np.ndarray) -> np.ndarray:
         """Return the projections of clean motions, (B, V, L, J, 2)."""
         if self.cameras.orthographic:
             return self.views.project(motions)
-        return self._normalised.project(motions)
+        scale = self.prior.scale
+        return self.cameras.project(motions * scale) / scale
 
     def _denoise(self, x_t: np.ndarray, alpha_bar: float) -> np.ndarray:
         try:

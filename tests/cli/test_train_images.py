@@ -17,14 +17,13 @@ from probmotion.models.images.category import Category
 from probmotion.models.images.encoder_training import encoder_of
 from probmotion.models.images.surface import rest_surface
 from probmotion.models.latent.turn_code import TurnCode
-from probmotion.models.vae.motion_vae import MotionVAE
 from probmotion.reconstruction import learning, refinement
 
 
 @pytest.fixture(scope="module")
 def start(tmp_path_factory):
     """File of a category without an encoder."""
-    body, rng = MotionVAE.load("animal-vae").body, np.random.default_rng(0)
+    body, rng = Category.load("quadruped").body, np.random.default_rng(0)
     turns = 0.15 * rng.standard_normal((4, 1, len(body.bones), 3))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(category_module, "rest_surface", lambda body: rest_surface(body, 250))

@@ -37,13 +37,6 @@ def random_cameras(orthographic):
 
 
 @pytest.mark.parametrize("orthographic", [True, False])
-def test_scaled_cameras_see_a_scaled_scene(orthographic):
-    cameras, world = random_cameras(orthographic), points(2, 5)
-    image = cameras.scaled(3.0).project(3.0 * world)
-    np.testing.assert_allclose(image, 3.0 * cameras.project(world), rtol=1e-12)
-
-
-@pytest.mark.parametrize("orthographic", [True, False])
 def test_projection_agrees_with_its_definition(library, orthographic):
     cameras = random_cameras(orthographic)
     world = points(2, 4, 5)

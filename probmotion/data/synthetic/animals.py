@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from probmotion import seeds
 from probmotion.data.synthetic.cycles import repeated_cycle
 from probmotion.data.synthetic.gaits import GAITS, make_gait
 from probmotion.files import read_arrays
@@ -20,7 +21,14 @@ from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_count, check_positive
 
-__all__ = ["ANIMAL_SKELETON", "DOG_CLIPS", "animal_clips", "dog_clips", "synthetic_animals"]
+__all__ = [
+    "ANIMAL_SKELETON",
+    "DOG_CLIPS",
+    "VARIED_TRUNKS",
+    "animal_clips",
+    "dog_clips",
+    "synthetic_animals",
+]
 
 _FPS = 30.0
 _STYLES = tuple(style for style, gait in GAITS.items() if gait.body == "quadruped")
@@ -37,19 +45,29 @@ DOG_CLIPS: Mapping[str, tuple[str, ...]] = {
 animals trot as well. Four cycles are too few for a recorded validation part."""
 
 
+VARIED_TRUNKS = (0.65, 1.05)
+"""Range of trunk lengths relative to those of gaits; that of the recorded dog is .72."""
+
+
 def animal_clips(
-    folder: str | Path | None = None, *, n: int = 60, seconds: float = 6.0, seed: int = 0
+    folder: str | Path | None = None,
+    *,
+    n: int = 60,
+    seconds: float = 6.0,
+    seed: int = 0,
+    trunks: tuple[float, float] = (1.0, 1.0),
 ) -> dict[str, list[Motion]]:
     """Return animal clips in the parts "train", "validation" and "test", at 30 fps.
 
     The training part has ``n`` synthetic clips of ``seconds`` s; validation and test have n / 5
-    each, at least 2. ``seed`` is the seed of these clips. If ``folder`` is given, its recorded dog
-    clips (:func:`dog_clips`) are added.
+    each, at least 2. ``seed`` is the seed of these clips, ``trunks`` the range of their trunk
+    lengths (:func:`synthetic_animals`). If ``folder`` is given, its recorded dog clips
+    (:func:`dog_clips`) are added.
     """
     check_count("n", n)
     frames = _frames(seconds)
     held_out = max(n // 5, len(_STYLES))
-    clips = synthetic_animals(n + 2 * held_out, frames, _FPS, seed)
+    clips = synthetic_animals(n + 2 * held_out, frames, _FPS, seed, trunks=trunks)
     end = n + held_out
     parts = {"train": clips[:n], "validation": clips[n:end], "test": clips[end:]}
     if folder is None:
@@ -73,16 +91,25 @@ def dog_clips(folder: str | Path, *, seconds: float = 6.0) -> dict[str, list[Mot
 
 
 def synthetic_animals(
-    n: int = 60, frames: int = 180, fps: float = _FPS, seed: int = 0
+    n: int = 60,
+    frames: int = 180,
+    fps: float = _FPS,
+    seed: int = 0,
+    *,
+    trunks: tuple[float, float] = (1.0, 1.0),
 ) -> list[Motion]:
     """Return ``n`` procedural quadrupeds of ``frames`` frames at ``fps`` frames per second.
 
     Clips of walk and trot alternate, named ``quadruped-walk-0``, …. Trunk and paws follow
-    :mod:`probmotion.data.synthetic.gaits`; the legs have a dog's proportions. A clip depends only
-    on its number and ``seed``.
+    :mod:`probmotion.data.synthetic.gaits`; the legs have a dog's proportions. Lengths of trunks
+    relative to those of the gaits are uniform in ``trunks``; front paws move with the shoulders. A
+    clip depends only on its number and ``seed``.
     """
     check_count("n", n)
-    return [_quadruped(number, frames, fps, seed) for number in range(n)]
+    if not 0 < trunks[0] <= trunks[1]:
+        raise ValueError(f"trunks must be two increasing numbers above 0, got {trunks}")
+    factors = [seeds.generator(seed, "trunk", number).uniform(*trunks) for number in range(n)]
+    return [_quadruped(number, frames, fps, seed, trunk) for number, trunk in enumerate(factors)]
 
 
 def _frames(seconds: float) -> int:
@@ -118,12 +145,16 @@ _FORE = (np.array([0.19, 0.2225, 0.09]) / 0.5025 * _LEG_LENGTH, (50.0, 175.0))
 _HIND = (np.array([0.2, 0.225, 0.135]) / 0.56 * _LEG_LENGTH, (95.0, 152.0))
 
 
-def _quadruped(number: int, frames: int, fps: float, seed: int) -> Motion:
-    """Return quadruped ``number``; the styles alternate."""
+def _quadruped(number: int, frames: int, fps: float, seed: int, trunk: float) -> Motion:
+    """Return quadruped ``number`` with a relative length of the trunk; the styles alternate."""
     style = _STYLES[number % len(_STYLES)]
     gait = make_gait(style, number // len(_STYLES), frames=frames, fps=fps, seed=seed)
     joint = dict(zip(gait.skeleton.joint_names, gait.positions.swapaxes(0, 1), strict=True))
-    pelvis, neck = joint["tail"], joint["neck"]
+    pelvis = joint["tail"]
+    shift = (trunk - 1.0) * (joint["neck"] - pelvis)
+    for name in ("neck", "nose", "left_front_paw", "right_front_paw"):
+        joint[name] = joint[name] + shift
+    neck = joint["neck"]
     left = _unit(joint["left_hip"] - joint["right_hip"])
     up = np.broadcast_to([0.0, 1.0, 0.0], left.shape)
     back = _unit(neck - pelvis)

@@ -107,6 +107,24 @@ def test_trunk_and_paws_follow_the_gaits(synthetic):
         np.testing.assert_allclose(angle, 95 + (152 - 95) * extension, atol=1e-6)
 
 
+def test_trunks_vary_but_legs_do_not(synthetic):
+    varied = synthetic_animals(12, frames=120, trunks=(0.65, 1.05))
+    ratios = []
+    for clip, usual in zip(varied, synthetic, strict=True):
+        assert_quadruped(clip)
+        trunk, before = (path_of(one, "neck") - path_of(one, "pelvis") for one in (clip, usual))
+        ratio = np.linalg.norm(trunk[0]) / np.linalg.norm(before[0])
+        np.testing.assert_allclose(trunk, ratio * before, atol=1e-9)
+        for side in SIDES:
+            for joint, above in (("elbow", "shoulder"), ("knee", "hip"), ("front_paw", "wrist")):
+                bone = path_of(clip, f"{side}_{joint}") - path_of(clip, f"{side}_{above}")
+                same = path_of(usual, f"{side}_{joint}") - path_of(usual, f"{side}_{above}")
+                np.testing.assert_allclose(bone, same, atol=1e-9)
+        ratios.append(ratio)
+    assert 0.65 < min(ratios) < max(ratios) < 1.05
+    assert np.ptp(ratios) > 0.2
+
+
 def test_animal_does_not_depend_on_other_animals(synthetic):
     for clip, again in zip(synthetic_animals(3, frames=60), synthetic, strict=False):
         np.testing.assert_allclose(clip.positions[:, 0], again.positions[:60, 0])
@@ -165,3 +183,5 @@ def test_invalid_input(tmp_path):
         animal_clips(seconds=0)
     with pytest.raises(ValueError, match="n must be an integer of at least 1, got 0"):
         synthetic_animals(0)
+    with pytest.raises(ValueError, match="trunks must be two increasing numbers above 0, got"):
+        synthetic_animals(1, trunks=(1.0, 0.5))

@@ -88,6 +88,8 @@ def test_levels_invert_the_schedule(power):
         strided = schedule.strided(steps)
         result = [size.level(alpha_bar) for alpha_bar in strided.alpha_bar]
         np.testing.assert_allclose(result, strided.times, atol=1e-9)
+    tenth = 1 / (1 + (0.1 * schedule.sigma(1)) ** 2)  # halfway from .01 to 1 σ₁ in log noise
+    assert size.level(tenth) == pytest.approx(0.5)
     levels = [size.level(alpha_bar) for alpha_bar in np.linspace(1, schedule.alpha_bar[-1], 500)]
     assert (np.diff(levels) >= 0).all()
     with pytest.raises(ValueError, match=r"noise levels must be at most .*, got .*; use levels=C"):
@@ -95,6 +97,14 @@ def test_levels_invert_the_schedule(power):
     for wrong in (1.1, 0.0, float("nan")):
         with pytest.raises(ValueError, match=r"alpha_bar must be above 0 and at most 1, got .*"):
             size.level(wrong)
+
+
+@pytest.mark.parametrize("alpha_bar", [-0.5, 0.0, 1.1, 1e-9])
+def test_levels_are_checked_first(prior, alpha_bar):
+    x_t = np.zeros((1, 1, 4, prior.skeleton.n_joints, 2))
+    for method in (prior.denoise, prior.view_covariance):
+        with pytest.raises(ValueError, match=r"(alpha_bar|noise levels) must be"):
+            method(x_t, alpha_bar, Cameras.ring(1))
 
 
 def test_results_do_not_depend_on_batch_threads_or_cameras(prior):

@@ -21,9 +21,8 @@ def small_quadruped() -> Category:
         pytest.importorskip(library, reason=f"{library} is not installed")
     from probmotion.models.images.category import Category
     from probmotion.models.images.surface import rest_surface
-    from probmotion.models.vae.motion_vae import MotionVAE
 
-    body, rng = MotionVAE.load("animal-vae").body, np.random.default_rng(0)
+    body, rng = Category.load("quadruped").body, np.random.default_rng(0)
     surface = rest_surface(body, 200)
     path = np.linspace(0, 1, 10)[:, None, None]
     ends = 0.12 * rng.normal(size=(2, 4, 1, len(body.bones), 3))

@@ -18,13 +18,12 @@ from probmotion.models.images.made_images import make_category, make_clips, with
 from probmotion.models.images.surface import rest_surface
 from probmotion.models.images.surface_prior import SurfacePrior
 from probmotion.models.latent.turn_code import TurnCode
-from probmotion.models.vae.motion_vae import MotionVAE
 
 
 @pytest.fixture(scope="module")
 def case():
     """A category, a made one with features, 40 images of that and their θ."""
-    body, rng = MotionVAE.load("animal-vae").body, np.random.default_rng(0)
+    body, rng = Category.load("quadruped").body, np.random.default_rng(0)
     turns = 0.15 * rng.standard_normal((4, 1, len(body.bones), 3))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "rest_surface", lambda body: rest_surface(body, 250))

@@ -6,7 +6,13 @@ import pytest
 from probmotion import Joints3D, MotionPosterior
 from probmotion.geometry.cameras import Cameras
 from probmotion.models.mixture.conditioned_mixture import ConditionedMixture
-from probmotion.posteriors.protocols import Denoises2D, Denoises3D, HasExactPosterior, NotConjugate
+from probmotion.posteriors.protocols import (
+    Denoises2D,
+    Denoises3D,
+    HasExactPosterior,
+    NotConjugate,
+    OrthographicOnly,
+)
 from probmotion.problems import load_problem
 from probmotion.problems.conditioned import conditioned
 
@@ -91,7 +97,11 @@ def test_invalid_input_is_rejected(posterior, mixture):
         (ValueError, "alpha_bar must be between 0 and", lambda: mixture.denoise_motion(x_t, 1.0)),
         (ValueError, "alpha_bar must be between 0 and", lambda: mixture.denoise_motion(x_t, 0.0)),
         (ValueError, r"got \(3, 2, 17, 3\)", lambda: mixture.denoise_motion(x_t[:, :2], 0.5)),
-        (ValueError, "got perspective", lambda: mixture.denoise(x_t[..., :2], 0.5, perspective)),
+        (
+            OrthographicOnly,
+            "got perspective",
+            lambda: mixture.denoise(x_t[..., :2], 0.5, perspective),
+        ),
         (NotConjugate, "must be None", lambda: mixture.exact_posterior(posterior.likelihood)),
         (NotConjugate, "Student-t", lambda: ConditionedMixture(posterior.prior, outliers)),
     ):

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 
 from probmotion import Cameras, Joints3D, MotionPosterior
-from probmotion.posteriors.protocols import Denoises2D, Denoises3D, HasExactPosterior, NotConjugate
+from probmotion.posteriors.protocols import (
+    Denoises2D,
+    Denoises3D,
+    HasExactPosterior,
+    NotConjugate,
+    OrthographicOnly,
+)
 
 VIEWS = Cameras.ring(2, elevation=0.3)
 
@@ -62,7 +68,7 @@ def test_invalid_input_is_rejected(prior, make_likelihood, noisy):
         ),
         (ValueError, r"got \(3, 2, 4, 3\)", lambda: conditioned.denoise_motion(x_t[:, :2], 0.5)),
         (
-            ValueError,
+            OrthographicOnly,
             "got perspective",
             lambda: conditioned.denoise(x_t[..., :2], 0.5, perspective),
         ),

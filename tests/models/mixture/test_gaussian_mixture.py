@@ -294,7 +294,7 @@ def test_unsupported_likelihoods_and_cameras_are_rejected(prior, motions):
         prior.exact_posterior(Keypoints2D.observe(truth, camera, 0.1, 0))
     with pytest.raises(protocols.NotConjugate, match="Student-t"):
         prior.exact_posterior(Joints3D.observe(truth, 0.1, 0, degrees_of_freedom=4.0))
-    with pytest.raises(ValueError, match="cameras must be orthographic, got perspective"):
+    with pytest.raises(protocols.OrthographicOnly, match="cameras must be orthographic, got persp"):
         prior.denoise(np.zeros((1, 1, L, J, 2)), 0.5, camera)
     with pytest.raises(ValueError, match="coordinates must be 'positions', got 'latent'"):
         prior.motion(np.zeros(R))

@@ -163,15 +163,15 @@ def test_denoisers_are_in_single_precision_whatever_the_input():
 class Rounded(MotionDiffusion):
     """Prior with other rounding errors in its network, as on another device."""
 
-    def _network_at(self, alpha_bar):
-        network = super()._network_at(alpha_bar)
+    def __init__(self, network, *data, **options):
+        super().__init__(network, *data, **options)
         rng = torch.Generator().manual_seed(1)
 
-        def denoise(noisy):
-            clean = network(noisy)
+        def rounded(motions, levels):
+            clean = network(motions, levels)
             return clean * (1 + 1e-6 * torch.randn(clean.shape, generator=rng))
 
-        return denoise
+        self._network = rounded
 
 
 def draws_of(name, prior):

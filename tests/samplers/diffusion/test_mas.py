@@ -200,12 +200,14 @@ def test_stop_level_returns_the_estimate_at_that_level(gaussian):
     np.testing.assert_array_equal(trace.result, complete.steps[-1].estimate)
 
 
-def test_distant_perspective_views_are_orthographic(gaussian):
+@pytest.mark.parametrize("weights", [None, (5.0, 1.0, 1.0, 0.5, 1.0)])
+def test_distant_perspective_views_are_orthographic(gaussian, weights):
     posterior = MotionPosterior(gaussian)
-    orthographic = MultiViewAncestral(steps=10).sample(posterior, draws=5, progress=False).flat()
+    sampler = MultiViewAncestral(steps=10, view_weights=weights)
+    orthographic = sampler.sample(posterior, draws=5, progress=False).flat()
     errors = []
     for distance in (1e3, 1e4):
-        sampler = MultiViewAncestral(steps=10, perspective=True, distance=distance)
+        sampler = replace(sampler, perspective=True, distance=distance)
         perspective = sampler.sample(posterior, draws=5, progress=False)
         errors.append(abs(perspective.flat() - orthographic).max())
     assert errors[0] < 1e-2

@@ -153,6 +153,7 @@ def test_guided_draws_are_closer_to_the_observations(prior, sampler, kind):
 
 
 OBSERVED = Joints3D(np.zeros((10, 4, 3)), noise=0.1)
+FEW_STEPS = SplitGibbs(steps=4, sweeps=2, inner_steps=4, start_steps=8, particles=3)
 SAMPLERS = [
     MultiViewAncestral(steps=6),
     MultiViewAncestral(steps=6, perspective=True),
@@ -162,7 +163,7 @@ SAMPLERS = [
 ]
 
 
-@pytest.mark.parametrize("sampler", [*SAMPLERS, SplitGibbs(4, 2, 4, start_steps=8, particles=3)])
+@pytest.mark.parametrize("sampler", [*SAMPLERS, FEW_STEPS])
 def test_draws_are_bit_identical_for_any_batch(prior, sampler):
     likelihood = OBSERVED if isinstance(sampler, SplitGibbs) else None
     motions = draw(sampler, prior, likelihood, draws=13)
