@@ -185,9 +185,8 @@ class Cameras:
     def depth(self, points: Array) -> Array:
         """Return depths along the cameras' z axes: ``(…, L, J, 3) → (…, V, L, J)``, metres."""
         xp = array_namespace(points)
-        depth = constant(self.translation[:, 2], points)
-        along = xp.matmul(constant(self.rotation[:, 2:], points), _columns(points))
-        depth = along + depth[:, None, None]
+        along = xp.matmul(constant(self.rotation[:, 2], points), _columns(points))
+        depth = along + constant(self.translation[:, 2:], points)
         return xp.reshape(depth, (*points.shape[:-3], self.n_views, *points.shape[-3:-1]))
 
     def project(self, points: Array) -> Array:
@@ -201,15 +200,17 @@ class Cameras:
         check_shape("points", points, ("…", "L", "J", 3))
         xp = array_namespace(points)
         # Coordinates before points, (…, V, 2, L J): NumPy is slow along axes of two entries.
-        image = xp.matmul(constant(self.image_axes, points), _columns(points))
-        if self.orthographic:
-            image = image + constant(self.offset, points)[..., None]
-        else:
-            shift = constant(self.focal[:, None] * self.translation[:, :2], points)
+        image = xp.matmul(constant(self.image_axes.reshape(-1, 3), points), _columns(points))
+        image = xp.reshape(image, (*points.shape[:-3], self.n_views, 2, image.shape[-1]))
+        shift = self.focal[:, None] * self.translation[:, :2]
+        image = image + constant(shift[..., None], points)
+        if not self.orthographic:
             depth = self.depth(points)
             self._check_in_front(depth)
-            depth = xp.reshape(depth, (*image.shape[:-2], 1, image.shape[-1]))
-            image = (image + shift[..., None]) / depth + constant(self.centre, points)[..., None]
+            image = image / xp.reshape(depth, (*image.shape[:-2], 1, image.shape[-1]))
+        assert self.centre is not None
+        if self.centre.any():
+            image = image + constant(self.centre[..., None], points)
         shape = (*points.shape[:-3], self.n_views, *points.shape[-3:-1], 2)
         return xp.reshape(xp.matrix_transpose(image), shape)
 
@@ -226,7 +227,7 @@ class Cameras:
 
 
 def _columns(points: Array) -> Array:
-    """Return the points as columns, ``(…, L, J, 3) → (…, 1, 3, L J)``."""
+    """Return the points as columns, ``(…, L, J, 3) → (…, 3, L J)``."""
     xp = array_namespace(points)
     *batch, L, J, _ = points.shape
-    return xp.matrix_transpose(xp.reshape(points, (*batch, 1, L * J, 3)))
+    return xp.matrix_transpose(xp.reshape(points, (*batch, L * J, 3)))

@@ -70,9 +70,11 @@ def reverse_diffusion(
     for t in range(schedule.steps, stop, -1):
         step = integrator.transition(state, x, t, before)
         before = step.estimate
-        x = step.noisy * x + step.clean * state.embed(step.combined)
+        x = step.noisy * x
+        x += step.clean * state.embed(step.combined)
         noise = state.noise(streams, t - 1)
-        x += step.deviation * noise
+        if step.deviation > 0:
+            x += step.deviation * noise
         if watch is not None:
             watch(step, noise)
         if corrector is not None:
