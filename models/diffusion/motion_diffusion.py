@@ -148,7 +148,8 @@ class MotionDiffusion(TrackNetwork):
         Raises
         ------
         ValueError
-            If the shape is wrong, a value is not finite or ᾱ is not above 0 and at most 1.
+            If the shape is wrong, a value is not finite, or ᾱ is above 1 or below the network's
+            last level.
         """
         self._check(x_t)
         if alpha_bar == 1:
@@ -170,9 +171,11 @@ class MotionDiffusion(TrackNetwork):
         """Return v ↦ (1−ᾱ)/√ᾱ Dᵀ v, D the Jacobian of :meth:`denoise`; arrays (B, V, L, J, 2).
 
         For the exact denoiser, the product is Cov[x₀ | x_t] v (Tweedie). The Jacobian of a network
-        is only approximately symmetric.
+        is only approximately symmetric. Raises as :meth:`denoise`.
         """
         self._check(x_t)
+        if alpha_bar == 1:
+            return np.zeros_like
         level = self.settings.level(alpha_bar)
         standardised = self._standardised(x_t, alpha_bar)
         factor = (1 - alpha_bar) / math.sqrt(alpha_bar) / self._spread(alpha_bar)

@@ -21,8 +21,8 @@ __all__ = ["SeparateViews"]
 class SeparateViews:
     """State with V noisy views per draw, (B, V, L, J, 2); ``shape`` is (L, J, 3).
 
-    All arrays are in normalised units. Shared noise is projected orthographically to ``views``.
-    ``weights`` w_v of the views; 1 by default.
+    All arguments and results are in normalised units. Shared noise is projected orthographically to
+    ``views``. ``weights`` w_v of the views; 1 by default.
     """
 
     prior: Denoises2D
@@ -33,7 +33,7 @@ class SeparateViews:
     shared_noise: bool
     counts: dict[str, int] = field(default_factory=lambda: {"denoiser": 0})
     views: Views = field(init=False)
-    # Previous triangulation, metres: the initial value of the next, which it makes faster.
+    # Previous triangulation, metres; initial value of the next one.
     _last: np.ndarray | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:

@@ -46,7 +46,7 @@ animals trot as well. Four cycles are too few for a recorded validation part."""
 
 
 VARIED_TRUNKS = (0.65, 1.05)
-"""Range of trunk lengths relative to those of gaits; that of the recorded dog is .72."""
+"""Range of trunk lengths relative to those of gaits; the recorded dog is at .72."""
 
 
 def animal_clips(
@@ -102,12 +102,15 @@ def synthetic_animals(
 
     Clips of walk and trot alternate, named ``quadruped-walk-0``, …. Trunk and paws follow
     :mod:`probmotion.data.synthetic.gaits`; the legs have a dog's proportions. Lengths of trunks
-    relative to those of the gaits are uniform in ``trunks``; front paws move with the shoulders. A
-    clip depends only on its number and ``seed``.
+    relative to those of the gaits are uniform in ``trunks``; front paws are displaced with the
+    shoulders. A clip depends only on its number and ``seed``.
     """
     check_count("n", n)
-    if not 0 < trunks[0] <= trunks[1]:
-        raise ValueError(f"trunks must be two increasing numbers above 0, got {trunks}")
+    shortest, longest = trunks
+    if not 0 < shortest <= longest < np.inf:
+        raise ValueError(
+            f"trunks must be two finite numbers above 0, the first at most the second, got {trunks}"
+        )
     factors = [seeds.generator(seed, "trunk", number).uniform(*trunks) for number in range(n)]
     return [_quadruped(number, frames, fps, seed, trunk) for number, trunk in enumerate(factors)]
 

@@ -6,6 +6,7 @@ import pytest
 from probmotion.data.synthetic.animals import (
     ANIMAL_SKELETON,
     DOG_CLIPS,
+    VARIED_TRUNKS,
     animal_clips,
     dog_clips,
     synthetic_animals,
@@ -108,7 +109,7 @@ def test_trunk_and_paws_follow_the_gaits(synthetic):
 
 
 def test_trunks_vary_but_legs_do_not(synthetic):
-    varied = synthetic_animals(12, frames=120, trunks=(0.65, 1.05))
+    varied = synthetic_animals(12, frames=120, trunks=VARIED_TRUNKS)
     ratios = []
     for clip, usual in zip(varied, synthetic, strict=True):
         assert_quadruped(clip)
@@ -130,6 +131,15 @@ def test_animal_does_not_depend_on_other_animals(synthetic):
         np.testing.assert_allclose(clip.positions[:, 0], again.positions[:60, 0])
     other = synthetic_animals(1, frames=120, seed=1)[0]
     assert not np.array_equal(other.positions, synthetic[0].positions)
+    (one,), (again, _), (other,) = (
+        synthetic_animals(n, 10, seed=seed, trunks=VARIED_TRUNKS)
+        for n, seed in ((1, 0), (2, 0), (1, 1))
+    )
+    trunks = [
+        np.linalg.norm(path_of(clip, "neck")[0] - path_of(clip, "pelvis")[0])
+        for clip in (one, again, other)
+    ]
+    assert trunks[0] == trunks[1] != trunks[2]
 
 
 def test_dogs_move_as_in_their_cycles(dogs, real_data):
@@ -160,6 +170,10 @@ def test_parts_are_disjoint_and_have_both_gaits():
         assert {clip.name.split("-")[1] for clip in clips} == {"walk", "trot"}
         assert {clip.frames for clip in clips} == {60}
     assert len({clip.name for clips in parts.values() for clip in clips}) == 14
+    varied = animal_clips(n=10, seconds=2.0, trunks=VARIED_TRUNKS)
+    expected = synthetic_animals(14, 60, trunks=VARIED_TRUNKS)
+    for clip, again in zip((c for clips in varied.values() for c in clips), expected, strict=True):
+        np.testing.assert_array_equal(clip.positions, again.positions)
 
 
 def test_dogs_come_first_and_must_be_cycles(real_data, tmp_path):
@@ -183,5 +197,5 @@ def test_invalid_input(tmp_path):
         animal_clips(seconds=0)
     with pytest.raises(ValueError, match="n must be an integer of at least 1, got 0"):
         synthetic_animals(0)
-    with pytest.raises(ValueError, match="trunks must be two increasing numbers above 0, got"):
+    with pytest.raises(ValueError, match="trunks must be two finite numbers above 0, the first"):
         synthetic_animals(1, trunks=(1.0, 0.5))

@@ -105,6 +105,7 @@ def test_levels_are_checked_first(prior, alpha_bar):
     for method in (prior.denoise, prior.view_covariance):
         with pytest.raises(ValueError, match=r"(alpha_bar|noise levels) must be"):
             method(x_t, alpha_bar, Cameras.ring(1))
+    assert (prior.view_covariance(x_t, 1.0, Cameras.ring(1))(x_t + 1) == 0).all()
 
 
 def test_results_do_not_depend_on_batch_threads_or_cameras(prior):
