@@ -38,6 +38,7 @@ def test_draws_of_a_gaussian_have_its_moments(script):
     np.testing.assert_allclose(np.cov(standard.T), [[1, 0.9], [0.9, 1]], atol=6 / np.sqrt(n))
 
 
+@pytest.mark.slow
 def test_codes_drawn_given_simulated_motion_vary_as_those_simulated(script):
     prior, rng, n = MotionVAE.load("walk-vae"), np.random.default_rng(0), 16
     z = prior.initial(rng, n)

@@ -70,6 +70,7 @@ def test_shipped_files_and_held_out_clips(name, words):
         assert network["data"]["clips"] == evaluator["data"]["clips"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DIFFUSION)
 def test_2d_draws_are_almost_as_close_to_held_out_clips_as_training_clips(name):
     """The Fréchet distance is at most 1.5 times theirs; that of draws at half the speed is not."""
