@@ -43,11 +43,15 @@ class NoiseSchedule:
 
     def __post_init__(self) -> None:
         levels = np.asarray(self.alpha_bar, dtype=np.float64)
-        one_axis = levels.ndim == 1 and len(levels) > 1
-        if not one_axis or (np.diff([1.0, *levels[1:], 0.0]) >= 0).any() or levels[0] != 1.0:
+        if levels.ndim != 1 or len(levels) < 2:
+            raise ValueError(f"alpha_bar must have shape (T + 1,), got shape {levels.shape}")
+        falls = np.diff([*levels, 0.0]) < 0
+        if levels[0] != 1.0 or not falls.all():
+            first = int(np.argmin(falls)) if levels[0] == 1.0 else 0
+            given = ", ".join(f"{level:g}" for level in levels[first : first + 2])
             raise ValueError(
-                "alpha_bar must have shape (T + 1,) and decrease from 1 to a number above 0, got "
-                f"shape {levels.shape}; use NoiseSchedule.cosine"
+                f"alpha_bar must decrease from 1 to a number above 0, got {given} from level "
+                f"{first}; use NoiseSchedule.cosine with power 2"
             )
         times = np.arange(len(levels)) if self.times is None else np.asarray(self.times)
         object.__setattr__(self, "alpha_bar", levels)
@@ -67,7 +71,8 @@ class NoiseSchedule:
         check_count("steps", steps)
         angle = (np.arange(steps + 1) / steps + _OFFSET) / (1 + _OFFSET) * np.pi / 2
         raw = np.cos(angle) ** power
-        beta = np.minimum(1 - raw[1:] / raw[:-1], 0.999)
+        with np.errstate(invalid="ignore"):  # large powers underflow
+            beta = np.minimum(1 - raw[1:] / raw[:-1], 0.999)
         return cls(np.concatenate([[1.0], np.cumprod(1 - beta)]))
 
     @property

@@ -118,7 +118,7 @@ class SplitGibbs(ConditionalSampler):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, least in (("steps", 0), ("sweeps", 1), ("inner_steps", 2), ("start_steps", 2)):
+        for name, least in (("steps", 0), ("sweeps", 1), ("inner_steps", 3), ("start_steps", 2)):
             check_count(name, getattr(self, name), least=least)
         check_count("particles", self.particles, least=2)
         check_count("n_views", self.n_views, least=3)

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from probmotion.posteriors.posterior import MotionPosterior
-from probmotion.samplers.diffusion.guidance import can_guide
+from probmotion.samplers.diffusion.guidance import AnyGuidance, can_guide
 from probmotion.samplers.diffusion.integrators import AnyIntegrator, SecondOrderSDE, Transition
 from probmotion.samplers.diffusion.noise_levels import NoiseLevels, check_object
 from probmotion.samplers.diffusion.states import State
@@ -104,9 +104,11 @@ class AncestralSampler(NoiseLevels, IndependentSampler):
     least_effort: ClassVar[int] = 3
 
     integrator: AnyIntegrator
+    guidance: AnyGuidance
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_object("guidance", self.guidance, AnyGuidance)
         check_integrator(self.integrator, self.schedule.steps)
 
     def _batches(self, posterior: MotionPosterior, seed: int, progress: bool) -> Batches:

@@ -16,7 +16,11 @@ from probmotion.geometry.cameras import Cameras
 from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.protocols import Denoises2D
 from probmotion.posteriors.sampling import UnsupportedPosterior, require
-from probmotion.samplers.diffusion.ancestral import AncestralSampler, ancestral
+from probmotion.samplers.diffusion.ancestral import (
+    AncestralSampler,
+    ancestral,
+    check_integrator,
+)
 from probmotion.samplers.diffusion.guidance import AnyGuidance, MomentMatched, guide_towards
 from probmotion.samplers.diffusion.integrators import DDPM, AnyIntegrator, Transition
 from probmotion.samplers.diffusion.noise_levels import AnyLevels, Cosine
@@ -95,6 +99,7 @@ class MultiViewAncestral(AncestralSampler):
             raise ValueError(
                 f"stop_level must be at most steps, {self.steps}, got {self.stop_level}"
             )
+        check_integrator(self.integrator, self.schedule.steps - self.stop_level + 1)
         if self.view_weights is not None:
             check_shape("view_weights", np.asarray(self.view_weights), (self.n_views,))
             for weight in self.view_weights:

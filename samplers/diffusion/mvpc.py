@@ -110,8 +110,8 @@ class MultiViewPredictorCorrector(AncestralSampler):
             value = getattr(self, name)
             if name == "gamma" and value is None:
                 continue
-            if not 0 <= value < math.inf:
-                raise ValueError(f"{name} must be a finite number of at least 0, got {value}")
+            if not (isinstance(value, int | float) and 0 <= value < math.inf):
+                raise ValueError(f"{name} must be a finite number of at least 0, got {value!r}")
 
     @classmethod
     def accurate(cls) -> MultiViewPredictorCorrector:

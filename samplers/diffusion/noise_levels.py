@@ -34,6 +34,11 @@ class Cosine:
     power: int = 2
     trained_steps: int | None = None
 
+    def __post_init__(self) -> None:
+        check_positive("power", self.power)
+        if self.trained_steps is not None:
+            check_count("trained_steps", self.trained_steps)
+
     def schedule(self, steps: int) -> NoiseSchedule:
         """Return the schedule of a number of levels."""
         if self.trained_steps is None:
@@ -65,8 +70,10 @@ class Karras:
     def schedule(self, steps: int) -> NoiseSchedule:
         """Return the schedule of a number of levels."""
         check_count("steps", steps, least=2)
-        power = 1 / self.rho
-        return _of_noise(np.linspace(self.smallest**power, self.largest**power, steps) ** self.rho)
+        power, ends = 1 / self.rho, np.array([self.smallest, self.largest])
+        with np.errstate(over="ignore", invalid="ignore"):  # as rho tends to 0
+            first, last = ends**power
+            return _of_noise(np.linspace(first, last, steps) ** self.rho)
 
 
 @dataclass(frozen=True)
@@ -124,10 +131,11 @@ def check_object(name: str, value: object, kinds: UnionType) -> None:
 def _of_noise(sigma: np.ndarray) -> NoiseSchedule:
     """Return the schedule with ascending noise levels σ_1, …, σ_T."""
     alpha_bar = np.concatenate([[1.0], 1 / (1 + sigma**2)])
-    if (np.diff(alpha_bar) >= 0).any():
+    if not (np.diff(alpha_bar) < 0).all():
         raise ValueError(
             f"noise must increase with every level, got {len(sigma)} levels between "
-            f"{sigma[0]:g} and {sigma[-1]:g} that rounding makes equal; use {_DEFAULT_RANGE}"
+            f"{sigma[0]:g} and {sigma[-1]:g} that rounding or overflow makes equal; "
+            f"use {_DEFAULT_RANGE}"
         )
     return NoiseSchedule(alpha_bar)
 

@@ -18,13 +18,15 @@ from probmotion.samplers.diffusion.guidance import (
     can_guide,
     guide_towards,
 )
-from probmotion.samplers.diffusion.noise_levels import AnyLevels, Karras, NoiseLevels
+from probmotion.samplers.diffusion.noise_levels import AnyLevels, Karras, NoiseLevels, check_object
 from probmotion.samplers.diffusion.views import MultiViewDenoiser, view_sets
 from probmotion.samplers.independent import Batches, IndependentSampler
 from probmotion.seeds import NormalStreams
 from probmotion.validation import check_count
 
 __all__ = ["StochSync"]
+
+_Guidance = WeightedTriangulation | Replacement
 
 _VIEWS, _RINGS = 3, 5  # views and alternating rings of learnt denoisers
 
@@ -59,12 +61,13 @@ class StochSync(NoiseLevels, IndependentSampler):
     steps: int = 40
     ode_steps: int = 5
     levels: AnyLevels = field(default_factory=Karras)
-    guidance: WeightedTriangulation | Replacement = field(default_factory=WeightedTriangulation)
+    guidance: _Guidance = field(default_factory=WeightedTriangulation)
     batch: int = 256
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_count("ode_steps", self.ode_steps)
+        check_object("guidance", self.guidance, _Guidance)
 
     def _batches(self, posterior: MotionPosterior, seed: int, progress: bool) -> Batches:
         prior, schedule, counts = posterior.prior, self.schedule, {"denoiser": 0}

@@ -37,7 +37,21 @@ def test_cosine_schedule_follows_the_formula():
         assert levels[-1] == pytest.approx(levels[-2] / 1000)  # β ≤ 0.999
 
 
-@pytest.mark.parametrize("levels", [[1.0], [0.9, 0.5], [1.0, 0.5, 0.5], [1.0, 0.5, 0.0]])
-def test_invalid_levels_are_refused(levels):
-    with pytest.raises(ValueError, match="decrease from 1 to a number above 0"):
+@pytest.mark.parametrize(
+    ("levels", "given"),
+    [
+        ([0.9, 0.5], "0.9, 0.5 from level 0"),
+        ([1.0, 0.5, 0.5], "0.5, 0.5 from level 1"),
+        ([1.0, 0.5, 0.7, 0.1], "0.5, 0.7 from level 1"),
+        ([1.0, 0.5, np.nan, 0.1], "0.5, nan from level 1"),
+        ([1.0, 0.5, 0.0], "0 from level 2"),
+    ],
+)
+def test_levels_that_do_not_fall_are_refused(levels, given):
+    with pytest.raises(ValueError, match=f"decrease from 1 to a number above 0, got {given}; use"):
         NoiseSchedule(np.array(levels))
+
+
+def test_levels_need_one_axis():
+    with pytest.raises(ValueError, match=r"must have shape \(T \+ 1,\), got shape \(1,\)"):
+        NoiseSchedule(np.array([1.0]))

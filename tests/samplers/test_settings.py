@@ -20,6 +20,7 @@ from probmotion.samplers import (
     ScoreDistillation,
     SequentialMonteCarlo,
 )
+from probmotion.samplers.diffusion import SecondOrderSDE, StochSync
 from probmotion.samplers.diffusion.ancestral2d import Ancestral2D
 from probmotion.samplers.diffusion.guidance import DPS, MomentMatched, WeightedTriangulation
 from probmotion.samplers.diffusion.noise_levels import Cosine
@@ -65,6 +66,20 @@ FREEDOM = "degrees_of_freedom must be a number above 0 or inf"
         (MultiViewPredictorCorrector, {"corrector_steps": -1}, f"corrector_steps {COUNT} 0"),
         (MultiViewPredictorCorrector, {"gamma_from": math.nan}, f"gamma_from {FROM_0}"),
         (MultiViewPredictorCorrector, {"gamma": -1.0}, f"gamma {FROM_0}"),
+        (MultiViewPredictorCorrector, {"gamma": "1"}, f"gamma {FROM_0}, got '1'"),
+        (
+            MultiViewAncestral,
+            {"stop_level": 99, "integrator": SecondOrderSDE()},
+            r"steps must be at least 3 with integrator SecondOrderSDE\(\), got 2",
+        ),
+        (Ancestral3D, {"guidance": "dps"}, r"guidance must be MomentMatched\(\), DPS\(\), Repl"),
+        (
+            MultiViewAncestral,
+            {"guidance": DPS},
+            r"guidance must be MomentMatched\(\), DPS\(\), Repl",
+        ),
+        (StochSync, {"guidance": DPS()}, r"must be WeightedTriangulation\(\) or Replacement\(\)"),
+        (Cosine, {"power": 0}, f"power {POSITIVE}"),
         (ScoreDistillation, {"levels": "falling"}, "levels must be one of uniform, annealed, got"),
         (ScoreDistillation, {"weighting": "none"}, "weighting must be one of constant, variance,"),
         (ScoreDistillation, {"azimuths": 2, "n_views": 3}, f"azimuths {COUNT} 3"),

@@ -206,8 +206,8 @@ def test_nothing_observed(gaussian, keypoints):
 def test_wrong_settings():
     with pytest.raises(ValueError, match=r"share must be below 1, as ρ must end below the noise"):
         SplitGibbs(share=1.2)
-    with pytest.raises(ValueError, match="inner_steps must be an integer of at least 2, got 1"):
-        SplitGibbs(inner_steps=1)
+    with pytest.raises(ValueError, match="inner_steps must be an integer of at least 3, got 2"):
+        SplitGibbs(inner_steps=2)
     with pytest.raises(ValueError, match="particles must be an integer of at least 2, got 1"):
         SplitGibbs(particles=1)
 

@@ -33,11 +33,19 @@ def test_limits_in_the_wrong_order_are_refused(kind, smallest):
         kind(smallest=smallest)
 
 
-@pytest.mark.parametrize("levels", [Karras(smallest=1e-9), LogSNR(smallest=1e-9), Karras(rho=1e20)])
+@pytest.mark.parametrize(
+    "levels",
+    [Karras(smallest=1e-9), LogSNR(smallest=1e-9), Karras(rho=1e20), Karras(rho=1e-3)],
+)
 def test_a_schedule_that_does_not_fall_is_refused(levels):
     message = f"noise must increase with every level, got 20 levels between .*; {DEFAULT_RANGE}"
     with pytest.raises(ValueError, match=message):
         Ancestral3D(steps=20, levels=levels)
+
+
+def test_a_power_that_underflows_is_refused():
+    with pytest.raises(ValueError, match=r"got 1\.8.*e-111, nan from level 45; use .* power 2"):
+        Ancestral3D(levels=Cosine(power=400))
 
 
 @pytest.mark.parametrize(
