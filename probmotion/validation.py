@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import sys
+import math
 from collections.abc import Iterable
 from dataclasses import fields
 from difflib import get_close_matches
@@ -16,6 +16,7 @@ from probmotion.arrays import Array, array_namespace, to_numpy
 __all__ = [
     "check_count",
     "check_finite",
+    "check_not_negative",
     "check_positive",
     "check_shape",
     "check_types",
@@ -61,9 +62,24 @@ def check_finite(name: str, value: Any) -> None:
 
 def check_positive(name: str, value: float) -> None:
     """Raise ``ValueError`` unless ``value`` is a finite number above zero."""
-    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    if not (number and 0 < value <= sys.float_info.max):
+    if not (_is_finite(value) and value > 0):
         raise ValueError(f"{name} must be a finite number above 0, got {value!r:.80}")
+
+
+def check_not_negative(name: str, value: float) -> None:
+    """Raise ``ValueError`` unless ``value`` is a finite number of at least zero."""
+    if not (_is_finite(value) and value >= 0):
+        raise ValueError(f"{name} must be a finite number of at least 0, got {value!r:.80}")
+
+
+def _is_finite(value: object) -> bool:
+    """Return whether a value is a finite real number."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer beyond floating point
+        return False
 
 
 def check_count(name: str, value: int, least: int = 1) -> None:

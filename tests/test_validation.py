@@ -6,6 +6,7 @@ import pytest
 from probmotion.validation import (
     check_count,
     check_finite,
+    check_not_negative,
     check_positive,
     check_shape,
 )
@@ -48,6 +49,11 @@ def test_invalid_numbers_are_refused():
     for value in (0, -1, np.nan, np.inf, 10**400, True, "1"):
         with pytest.raises(ValueError, match=r"x must be a finite number above 0, got .*"):
             check_positive("x", value)
+    check_not_negative("x", 0)
+    check_not_negative("x", np.float32(0.5))
+    for value in (-1e-300, np.nan, np.inf, 10**400, True, "1"):
+        with pytest.raises(ValueError, match=r"x must be a finite number of at least 0, got .*"):
+            check_not_negative("x", value)
     check_count("n", np.int64(3), least=3)
     for value, least in ((0, 1), (1.0, 1), (True, 1), ("3", 1), (None, 1), (2, 3)):
         with pytest.raises(ValueError, match=f"n must be an integer of at least {least}, got "):

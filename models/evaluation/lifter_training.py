@@ -26,6 +26,7 @@ from probmotion.models.evaluation.pose_flow_training import PoseTrainee
 from probmotion.models.training.devices import half_precision
 from probmotion.motion.motion import KeypointTrack
 from probmotion.motion.skeleton import Skeleton
+from probmotion.validation import check_not_negative
 
 __all__ = ["LifterTrainee", "LossWeights", "bone_sizes", "lifting_losses"]
 
@@ -57,8 +58,7 @@ class LossWeights:
 
     def __post_init__(self) -> None:
         for name, weight in asdict(self).items():
-            if not 0 <= weight < float("inf"):
-                raise ValueError(f"{name} must be a finite number of at least 0, got {weight}")
+            check_not_negative(name, weight)
 
 
 def bone_sizes(skeleton: Skeleton, poses: np.ndarray) -> np.ndarray:

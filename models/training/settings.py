@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
-from probmotion.validation import check_count, check_positive
+from probmotion.validation import check_count, check_not_negative, check_positive
 
 __all__ = ["TrainingSettings"]
 
@@ -76,10 +75,7 @@ class TrainingSettings:
             raise ValueError(f"ema must be at least 0 and below 1, got {self.ema}")
         if not self.clip > 0:
             raise ValueError(f"clip must be above 0, or inf to disable clipping, got {self.clip}")
-        if not 0 <= self.weight_decay < math.inf:
-            raise ValueError(
-                f"weight_decay must be a finite number of at least 0, got {self.weight_decay}"
-            )
+        check_not_negative("weight_decay", self.weight_decay)
 
     def rate(self, step: int) -> float:
         """Return the learning rate of a step, counted from 1."""

@@ -12,7 +12,7 @@ import numpy as np
 from probmotion.models.training.standardisation import Standards
 from probmotion.motion.motion import KeypointTrack
 from probmotion.motion.skeleton import Skeleton
-from probmotion.validation import check_count
+from probmotion.validation import check_count, check_not_negative
 
 __all__ = ["Augmentation", "Batch", "TrackBatches", "describe_tracks", "learning_and_held_out"]
 
@@ -48,8 +48,7 @@ class Augmentation:
             raise ValueError(f"shortest must be above 0 and at most 1, got {self.shortest}")
         if not 0 <= self.scale < 1:
             raise ValueError(f"scale must be at least 0 and below 1, got {self.scale}")
-        if not 0 <= self.shift < np.inf:
-            raise ValueError(f"shift must be a finite number of at least 0, got {self.shift}")
+        check_not_negative("shift", self.shift)
 
     @classmethod
     def none(cls) -> Augmentation:
@@ -108,8 +107,7 @@ class TrackBatches:
         augmentation: Augmentation,
     ) -> None:
         check_count("frames", frames, least=2)
-        if not 0 <= threshold < np.inf:
-            raise ValueError(f"threshold must be a finite number of at least 0, got {threshold}")
+        check_not_negative("threshold", threshold)
         _check_alike(tracks)
         self.skeleton: Skeleton = tracks[0].skeleton
         self.fps = tracks[0].fps

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
-
-from probmotion.validation import check_count
+from probmotion.validation import check_count, check_not_negative
 
 __all__ = ["CONFIDENCE_THRESHOLD", "MotionVAESettings"]
 
@@ -95,10 +93,7 @@ class MotionVAESettings:
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name} must be True or False, got {getattr(self, name)!r}")
         for name in _WEIGHTS:
-            weight = getattr(self, name)
-            number = isinstance(weight, int | float | np.number) and not isinstance(weight, bool)
-            if not (number and 0 <= weight < np.inf):
-                raise ValueError(f"{name} must be a finite number of at least 0, got {weight!r}")
+            check_not_negative(name, getattr(self, name))
 
     @classmethod
     def tiny(cls) -> MotionVAESettings:

@@ -15,7 +15,7 @@ import numpy as np
 from probmotion.extras import torch
 from probmotion.geometry.rotations import matrix_to_vector, vector_to_matrix
 from probmotion.models.vae.motion_vae import MotionVAE
-from probmotion.validation import check_count, check_finite, check_shape
+from probmotion.validation import check_count, check_finite, check_not_negative, check_shape
 
 __all__ = ["greatest_acceleration", "long_motion"]
 
@@ -103,8 +103,7 @@ def _check(
     check_count("iterations", iterations)
     if transitions is not None:
         check_count("transitions", transitions)
-    if not 0 <= weight < np.inf:
-        raise ValueError(f"prior_weight must be a finite number of at least 0, got {weight}")
+    check_not_negative("prior_weight", weight)
     if prior.frames <= 2 * _OVERLAP:
         raise ValueError(
             f"prior must have motions of at least {2 * _OVERLAP + 1} frames, got {prior.frames}"

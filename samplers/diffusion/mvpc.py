@@ -40,7 +40,7 @@ from probmotion.samplers.diffusion.noise_levels import AnyLevels, Cosine, Karras
 from probmotion.samplers.diffusion.states import MotionState, State
 from probmotion.samplers.diffusion.views import Views, pools, symmetric_power, view_sets
 from probmotion.seeds import NormalStreams
-from probmotion.validation import check_count, check_positive
+from probmotion.validation import check_count, check_not_negative, check_positive
 
 __all__ = ["MultiViewPredictorCorrector"]
 
@@ -106,12 +106,10 @@ class MultiViewPredictorCorrector(AncestralSampler):
         check_positive("corrector_size", self.corrector_size)
         if self.corrector_size > 1:
             raise ValueError(f"corrector_size must be at most 1, got {self.corrector_size}")
-        for name in ("gamma", "gamma_from", "corrected_from"):
-            value = getattr(self, name)
-            if name == "gamma" and value is None:
-                continue
-            if not (isinstance(value, int | float) and 0 <= value < math.inf):
-                raise ValueError(f"{name} must be a finite number of at least 0, got {value!r}")
+        if self.gamma is not None:
+            check_not_negative("gamma", self.gamma)
+        check_not_negative("gamma_from", self.gamma_from)
+        check_not_negative("corrected_from", self.corrected_from)
 
     @classmethod
     def accurate(cls) -> MultiViewPredictorCorrector:

@@ -30,7 +30,7 @@ from probmotion.samplers.independent import Batches, IndependentSampler
 from probmotion.samplers.variational.simulated_pairs import observed_entries
 from probmotion.seeds import NormalStreams
 from probmotion.threads import one_thread
-from probmotion.validation import check_count, check_positive
+from probmotion.validation import check_count, check_not_negative, check_positive
 
 __all__ = ["DVAEInference"]
 
@@ -104,8 +104,7 @@ class DVAEInference(IndependentSampler):
         freedom = self.degrees_of_freedom
         if freedom is not None and not (isinstance(freedom, Real) and freedom > 0):
             raise ValueError(f"degrees_of_freedom must be a number above 0 or inf, got {freedom!r}")
-        if not (isinstance(weight := self.latent_weight, Real) and 0 <= weight < math.inf):
-            raise ValueError(f"latent_weight must be a finite number of at least 0, got {weight!r}")
+        check_not_negative("latent_weight", self.latent_weight)
         if self.network is not None and not isinstance(self.network, InferenceNetwork):
             raise ValueError(f"network must be an InferenceNetwork, got {self.network!r}")
 

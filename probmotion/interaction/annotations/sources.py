@@ -13,7 +13,7 @@ from probmotion.interaction.annotations.local_frames import joint_roots, pair_fr
 from probmotion.interaction.annotations.views import view_angles
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
-from probmotion.validation import check_count, check_finite, check_shape
+from probmotion.validation import check_count, check_finite, check_not_negative, check_shape
 
 __all__ = ["ELEVATIONS", "DrawnAnnotations", "draw_annotations", "world_axes"]
 
@@ -84,8 +84,7 @@ def draw_annotations(
     """
     skeleton, fps = _common(motions)
     check_count("n", n)
-    if not (np.isfinite(noise) and noise >= 0):
-        raise ValueError(f"noise must be a finite number of at least 0, got {noise!r}")
+    check_not_negative("noise", noise)
     frame_rng, view_rng, noise_rng, hidden_rng = (
         seeds.generator(seed, "annotations", name)
         for name in ("frames", "views", "noise", "hidden")
