@@ -131,7 +131,7 @@ def check_object(name: str, value: object, kinds: UnionType) -> None:
 def _of_noise(sigma: np.ndarray) -> NoiseSchedule:
     """Return the schedule with ascending noise levels σ_1, …, σ_T."""
     alpha_bar = np.concatenate([[1.0], 1 / (1 + sigma**2)])
-    if not (np.diff(alpha_bar) < 0).all():
+    if (np.diff(alpha_bar) >= 0).any():
         raise ValueError(
             f"noise must increase with every level, got {len(sigma)} levels between "
             f"{sigma[0]:g} and {sigma[-1]:g} that rounding or overflow makes equal; "
