@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -133,10 +134,7 @@ def judge(statistics: Sequence[DrawStatistics]) -> Verdict:
         sentence = f"not mixed: R-hat {max(stuck):.3f}, must be at most {_RHAT_LIMIT}"
         return Verdict("not mixed", sentence, n_draws)
 
-    def pooled(part: Callable[[DrawStatistics], Any]) -> np.ndarray:
-        weights = np.array([run.n for run in statistics]) / n
-        return np.tensordot(weights, np.array([part(run) for run in statistics], float), axes=1)
-
+    pooled = partial(_pooled, statistics)
     quantities = [_mean_quantity(pooled(lambda run: run.mean), pooled(lambda run: run.spread), n)]
     ratios = pooled(lambda run: list(run.ratios.values())).tolist()
     for name, (log, variance) in zip(first.ratios, ratios, strict=True):
@@ -144,19 +142,23 @@ def judge(statistics: Sequence[DrawStatistics]) -> Verdict:
     proportions = pooled(lambda run: list(run.modes.values())) if first.modes else np.empty((0, 2))
     if len(first.modes) > 1:
         quantities.append(_modes_quantity(proportions, pooled(lambda run: run.modes_spread), n))
-    if first.classifier:
-        accuracy, deviation = map(float, pooled(lambda run: run.classifier))
-        deviation /= math.sqrt(len(statistics))
-        quantities.append(_classifier_quantity(accuracy, deviation, n))
+    # The effective sample size decides, so that some of the runs may have no value.
+    classified = [run for run in statistics if run.classifier]
+    if classified:
+        accuracy, deviation = map(float, _pooled(classified, lambda run: run.classifier))
+        deviation /= math.sqrt(len(classified))
+        of_classified = sum(run.n for run in classified)
+        quantities.append(_classifier_quantity(accuracy, deviation, of_classified))
     else:
         # Fewer draws do not suffice to be shown right.
         unknown = Quantity(
             "classifier", math.nan, 0.5, _CLASSIFIER_TOLERANCE, 1.0, 1.0, float(MIN_CLASSIFIED)
         )
         quantities.append(unknown)
-    if first.distance:
-        ratio, z = map(float, pooled(lambda run: run.distance))
-        p = float(stats.t.sf(z * math.sqrt(len(statistics)), N_SETS - 1))
+    measured = [run for run in statistics if run.distance]
+    if measured:
+        ratio, z = map(float, _pooled(measured, lambda run: run.distance))
+        p = float(stats.t.sf(z * math.sqrt(len(measured)), N_SETS - 1))
         quantities.append(
             Quantity("swd ratio", ratio, 1.0, _DISTANCE_TOLERANCE, p, math.nan, math.nan)
         )
@@ -179,6 +181,12 @@ def judge(statistics: Sequence[DrawStatistics]) -> Verdict:
         sentence = f"undecided at {n_draws} draws ({names}){about}"
         return Verdict("undecided", sentence, n_draws, tuple(quantities))
     return Verdict("right", "right", n_draws, tuple(quantities))
+
+
+def _pooled(runs: Sequence[DrawStatistics], part: Callable[[DrawStatistics], Any]) -> np.ndarray:
+    """Return the mean of a part of the statistics, weighted by the number of draws."""
+    weights = np.array([run.n for run in runs])
+    return np.tensordot(weights / weights.sum(), np.array([part(run) for run in runs], float), 1)
 
 
 def _fault(wrong: Mapping[str, Quantity], modes: Mapping[str, np.ndarray]) -> tuple[str, str]:

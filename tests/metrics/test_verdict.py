@@ -1,7 +1,7 @@
 """Verdicts: exact draws are right, each fault is wrong for its own reason."""
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -144,6 +144,22 @@ def test_seeds_are_pooled(monocular):
     assert pooled.is_right
     assert not judge(sets[:1]).is_wrong
     assert judge(sets[:1] * 4).n == 100
+
+
+@pytest.mark.parametrize("missing", ["classifier", "distance"])
+def test_runs_with_too_few_or_too_many_effective_draws_are_pooled(monocular, missing):
+    """Such a run has no classifier, or no reference sets of its size."""
+    sets = [statistics_of(monocular, motions) for motions in exact_sets(monocular, 4, 100)]
+    without = replace(sets[0], digest="other", **{missing: []})
+    name = {"classifier": "classifier", "distance": "swd ratio"}[missing]
+
+    def estimates(runs):
+        verdict = judge(runs)
+        return verdict.n, {q.name: q.estimate for q in verdict.quantities}[name]
+
+    _, expected = estimates(sets[1:])
+    assert estimates([without, *sets[1:]]) == (400, pytest.approx(expected))
+    assert estimates([*sets[1:], without]) == (400, pytest.approx(expected))
 
 
 def test_chains_that_disagree_are_not_mixed(gait):
