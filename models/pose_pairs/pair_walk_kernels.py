@@ -6,11 +6,16 @@ import numpy as np
 
 from probmotion.extras import numba
 from probmotion.interaction.geometry.graph_kernels import max_edges
+from probmotion.models.pose_pairs.annotation_moves import (
+    approach,
+    draw_sides,
+    log_side_probability,
+    scaled_depths,
+    transfer,
+)
 from probmotion.models.pose_pairs.pair_densities import (
     Physics,
-    Vector,
     ViewAnnotations,
-    image_axes,
     log_annotations,
     log_measure,
     log_penetration,
@@ -28,10 +33,12 @@ from probmotion.models.pose_pairs.pair_moves import (
     resample_placement,
 )
 
-__all__ = ["approach", "walk"]
+__all__ = ["walk"]
 
 _SURROGATE_STEPS = 40
 """Surrogate steps per proposal, for an acceptance rate of about two thirds."""
+_ANNOTATION_PROPOSALS = 4
+"""Proposals of another annotation per block of surrogate steps."""
 _VIEW_PROPOSALS = 6
 """View proposals per walk."""
 
@@ -56,7 +63,8 @@ def walk(
 
     Blocks of steps target a surrogate of L_v, the graph distance to one annotation, and are
     accepted or rejected as a whole (surrogate transitions, Liu 2001). The annotation is an
-    auxiliary variable, drawn given the pose with probability ∝ likelihood^power.
+    auxiliary variable, drawn given the pose with probability ∝ likelihood^power. Between blocks,
+    the pose may move from one annotation to another (:func:`transfer`).
 
     Updates in place: ``pose`` (J, 3), metres; ``parts`` (2 + 2 K,) of :func:`log_prior_terms`; and
     the counters of surrogate steps ``tried`` and ``taken`` (moves,).
@@ -75,12 +83,16 @@ def walk(
         )  # fmt: skip
         if power > 0:
             log_annotations(new_pose, view, body, views, new_logs)
-            ratio = power * (new_logs[chosen] - logs[chosen] - log_gain)
-            ratio += _log_sum_over_best(power * logs) - _log_sum_over_best(power * new_logs)
-            if not -rng.standard_exponential() < ratio:
-                continue
-            logs[:] = new_logs
-        pose[:], parts[:] = new_pose, new_parts
+            log_ratio = _log_ratio(logs, new_logs, chosen, chosen, power) - power * log_gain
+            if -rng.standard_exponential() < log_ratio:
+                pose[:], parts[:], logs[:] = new_pose, new_parts, new_logs
+            for _ in range(_ANNOTATION_PROPOSALS):
+                _propose_transfer(
+                    pose, parts, logs, view, power, body, physics, views, new_pose, new_parts,
+                    new_logs, rng,
+                )  # fmt: skip
+        else:
+            pose[:], parts[:] = new_pose, new_parts
     resample_placement(pose, parts, body, rng)
     if power == 0:
         view = int(rng.random() * len(views.vectors))
@@ -94,6 +106,58 @@ def walk(
         if other_log_l >= lower_bound:
             view, log_l = other, other_log_l
     return view, log_l
+
+
+@numba.njit(cache=True, nogil=True)
+def _propose_transfer(
+    pose: np.ndarray,
+    parts: np.ndarray,
+    logs: np.ndarray,
+    view: int,
+    power: float,
+    body: Body,
+    physics: Physics,
+    views: ViewAnnotations,
+    new_pose: np.ndarray,
+    new_parts: np.ndarray,
+    new_logs: np.ndarray,
+    rng: np.random.Generator,
+) -> None:
+    """Propose to move the pose from an annotation, drawn given the pose, to another.
+
+    Delayed acceptance: surrogates and measure first, then joint limits and penetration, then
+    likelihoods. Updates ``pose``, ``parts`` and ``logs`` in place; the other arrays are workspace.
+    """
+    near, old, new = views.near[view], _draw_index(power * logs, rng), int(rng.random() * len(logs))
+    if old == new:
+        return
+    depths = scaled_depths(pose, view, body, views)
+    sides = draw_sides(depths, rng)
+    log_volume = transfer(pose, sides, view, near[old], near[new], body, views, new_pose)
+    if log_volume == -np.inf:
+        return
+    log_sides = log_side_probability(sides, scaled_depths(new_pose, view, body, views))
+    log_sides -= log_side_probability(sides, depths)
+    errors, terms = np.empty((2, len(pose))), np.empty(max_edges(len(pose), views.prepared.graph))
+    log_gain = log_surrogate(new_pose, view, near[new], body, views, errors, terms)
+    log_gain -= log_surrogate(pose, view, near[old], body, views, errors, terms)
+    new_parts[:] = parts
+    new_parts[0], new_parts[1] = log_measure(new_pose, body), 0.0
+    log_ratio = log_volume + log_sides + power * log_gain + new_parts[0] - parts[0]
+    if not -rng.standard_exponential() < log_ratio:
+        return
+    lower_bound = log_prior(parts, physics) - parts[0] - rng.standard_exponential()
+    for person in range(len(body.roots)):
+        write_limit_terms(new_pose, person, physics, new_parts)
+    if not log_prior(new_parts, physics) - new_parts[0] >= lower_bound:
+        return
+    new_parts[1] = log_penetration(new_pose, physics)
+    if not log_prior(new_parts, physics) - new_parts[0] >= lower_bound:
+        return
+    log_annotations(new_pose, view, body, views, new_logs)
+    log_ratio = _log_ratio(logs, new_logs, old, new, power) - power * log_gain
+    if -rng.standard_exponential() < log_ratio:
+        pose[:], parts[:], logs[:] = new_pose, new_parts, new_logs
 
 
 @numba.njit(cache=True, nogil=True)
@@ -162,109 +226,17 @@ def _surrogate_walk(
 
 
 @numba.njit(cache=True, nogil=True)
-def approach(
-    pose: np.ndarray,
-    root: int,
-    ratio: float,
-    view: int,
-    annotation: int,
-    body: Body,
-    views: ViewAnnotations,
-    proposed: np.ndarray,
-) -> float:
-    """Move bones towards or away from those of an annotation; return the log ratio of volumes.
-
-    The angle of each bone of a person, or of all people if ``root`` is −1, to the annotation's bone
-    is multiplied by ``ratio``. That bone has the length of the pose's and is on the same side of
-    the image plane, or in it if it is too long. The inverse move has the ratio 1/``ratio``; −∞ if
-    there is none, because a bone would change sides. The annotation is rotated in the image to fit
-    the joints that define the local frame. Their bones stay, so that view and rotation do.
-    """
-    right, up, towards = image_axes(pose, view, body, views)
-    joints, n_joints = views.prepared.joints[annotation], len(pose)
-    image, middle, target = np.empty((2, n_joints)), np.zeros(2), np.zeros(2)
-    for joint in range(n_joints):
-        image[0, joint] = _component(pose[joint], right)
-        image[1, joint] = _component(pose[joint], up)
-        if body.framing[joint]:
-            for axis in range(2):
-                middle[axis] += image[axis, joint] / body.framing.sum()
-                target[axis] += joints[axis, joint] / body.framing.sum()
-    along, across = 0.0, 0.0
-    for joint in range(n_joints):
-        if body.framing[joint]:
-            x, y = image[0, joint] - middle[0], image[1, joint] - middle[1]
-            u, v = joints[0, joint] - target[0], joints[1, joint] - target[1]
-            along += u * x + v * y
-            across += u * y - v * x
-    size = np.sqrt(along * along + across * across)
-    if size == 0:
-        return -np.inf
-    cosine, sine = along / size, across / size
-    log_volume = 0.0
-    proposed[:] = pose
-    for joint in range(n_joints):
-        parent = body.parents[joint]
-        if body.framing[joint] or parent < 0:
-            continue
-        bone = pose[joint] - pose[parent]
-        if root < 0 or body.below[root, joint]:
-            x = image[0, joint] - image[0, parent]
-            y = image[1, joint] - image[1, parent]
-            z = _component(bone, towards)
-            u, v = joints[0, joint] - joints[0, parent], joints[1, joint] - joints[1, parent]
-            length = np.sqrt((bone**2).sum())
-            goal = _lifted(cosine * u - sine * v, sine * u + cosine * v, z, length)
-            (x, y, new_z), log_area = _scaled_angle((x, y, z), goal, ratio)
-            if log_area == -np.inf or (new_z > 0) != (z > 0):
-                return -np.inf
-            log_volume += log_area
-            for axis in range(3):
-                bone[axis] = x * right[axis] + y * up[axis] + new_z * towards[axis]
-        proposed[joint] = proposed[parent] + bone
-    return log_volume
-
-
-@numba.njit(cache=True, nogil=True)
-def _component(vector: np.ndarray, axis: Vector) -> float:
-    return vector[0] * axis[0] + vector[1] * axis[1] + vector[2] * axis[2]
-
-
-@numba.njit(cache=True, nogil=True)
-def _lifted(x: float, y: float, side: float, length: float) -> Vector:
-    """Return the direction of a bone of a length with an image, on the side of a depth."""
-    x, y = x / length, y / length
-    square = x * x + y * y
-    if square >= 1.0:
-        return x / np.sqrt(square), y / np.sqrt(square), 0.0
-    return x, y, np.copysign(np.sqrt(1.0 - square), side)
-
-
-@numba.njit(cache=True, nogil=True)
-def _scaled_angle(vector: Vector, goal: Vector, ratio: float) -> tuple[Vector, float]:
-    """Return a vector with its angle to a direction scaled, and the log ratio of solid angles."""
-    length = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
-    x, y, z = vector[0] / length, vector[1] / length, vector[2] / length
-    cosine = x * goal[0] + y * goal[1] + z * goal[2]
-    x, y, z = x - cosine * goal[0], y - cosine * goal[1], z - cosine * goal[2]
-    sine = np.sqrt(x * x + y * y + z * z)
-    angle = ratio * np.arctan2(sine, cosine)
-    if sine < 1e-12 or angle >= np.pi:
-        return vector, -np.inf
-    along, across = length * np.cos(angle), length * np.sin(angle) / sine
-    new = (
-        along * goal[0] + across * x,
-        along * goal[1] + across * y,
-        along * goal[2] + across * z,
-    )
-    return new, np.log(ratio * np.sin(angle) / sine)
-
-
-@numba.njit(cache=True, nogil=True)
 def _draw_index(logs: np.ndarray, rng: np.random.Generator) -> int:
     """Draw an index in proportion to exp(logs)."""
     total = np.cumsum(np.exp(logs - logs.max()))
     return min(int(np.searchsorted(total, rng.random() * total[-1], side="right")), len(logs) - 1)
+
+
+@numba.njit(cache=True, nogil=True)
+def _log_ratio(logs: np.ndarray, new_logs: np.ndarray, old: int, new: int, power: float) -> float:
+    """Return the log ratio of likelihood^power times the probability of the annotation."""
+    gain = power * (new_logs[new] - logs[old])
+    return gain + _log_sum_over_best(power * logs) - _log_sum_over_best(power * new_logs)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -108,7 +108,8 @@ class TemperedPairs:
 
         The state of each chain is stored twice a minute in files named after ``unfinished``, from
         which the same call resumes; the caller deletes them. Results do not depend on the number of
-        threads. Each step counts as one density evaluation, although most evaluate only part of it.
+        threads. Each step counts as one density evaluation, although most evaluate only part of it;
+        proposals of another view or annotation are not counted.
 
         Raises
         ------

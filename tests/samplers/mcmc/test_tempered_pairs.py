@@ -18,6 +18,8 @@ from probmotion import MotionPosterior
 from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.interaction.annotated_pairs import AnnotatedPairs
 from probmotion.interaction.annotations.sources import draw_annotations
+from probmotion.models.pose_pairs import pair_walk_kernels
+from probmotion.models.pose_pairs.annotation_moves import approach, transfer
 from probmotion.models.pose_pairs.pair_densities import (
     image_axes,
     log_annotations,
@@ -28,7 +30,7 @@ from probmotion.models.pose_pairs.pair_densities import (
     project_to_view,
 )
 from probmotion.models.pose_pairs.pair_moves import APPROACH, HINGE, STRETCH, moves_of, propose
-from probmotion.models.pose_pairs.pair_walk_kernels import approach, walk
+from probmotion.models.pose_pairs.pair_walk_kernels import walk
 from probmotion.models.pose_pairs.pose_pairs import PosePairPrior
 from probmotion.posteriors.sampling import Interrupted, suited
 from probmotion.posteriors.truncation import TruncatedPosterior
@@ -199,6 +201,69 @@ def test_the_volume_of_an_approach_is_that_of_solid_angles(prior, likelihood):
     assert total == pytest.approx(sum(factors), abs=1e-2)
 
 
+def test_a_transfer_is_inverted_by_its_inverse(prior, likelihood):
+    """Frame and bone lengths stay; the roots' distance and its volume are scaled."""
+    body, _, views = pair_arrays(MotionPosterior(prior, likelihood))
+    rng, (first, second) = np.random.default_rng(0), body.roots
+    ends, starts = np.array(prior.skeleton.bones).T
+    for view in range(5):
+        start, end = views.near[view, :2]
+        pose = prior.seed[0] + 0.02 * rng.standard_normal(prior.seed[0].shape)
+        sides = rng.choice([-1.0, 1.0], size=len(pose))
+        new, back = np.empty_like(pose), np.empty_like(pose)
+        log_volume = transfer(pose, sides, view, start, end, body, views, new)
+        inverse = transfer(new, sides, view, end, start, body, views, back)
+        assert inverse == pytest.approx(-log_volume, rel=1e-9)
+        np.testing.assert_allclose(back, pose, atol=1e-9)
+        axes = image_axes(pose, view, body, views)
+        np.testing.assert_allclose(image_axes(new, view, body, views), axes, atol=1e-9)
+        before, after = pose[ends] - pose[starts], new[ends] - new[starts]
+        np.testing.assert_allclose(*(np.linalg.norm(b, axis=1) for b in (before, after)))
+        apart = [np.linalg.norm(p[second] - p[first]) for p in (pose, new)]
+        assert log_volume == pytest.approx(3 * math.log(apart[1] / apart[0]))
+        seen = [views.prepared.joints[k][:, [first, second]] for k in (start, end)]
+        widths = [np.linalg.norm(joints[:, 1] - joints[:, 0]) for joints in seen]
+        assert apart[1] / apart[0] == pytest.approx(widths[1] / widths[0])
+
+
+def test_a_transfer_needs_roots_apart(prior, likelihood):
+    """If roots of an annotation coincide, no distance can be scaled, and the walk goes on."""
+    body, physics, views = pair_arrays(MotionPosterior(prior, likelihood))
+    pose, new, parts = prior.seed[0].copy(), np.empty_like(prior.seed[0]), np.zeros(6)
+    joints = views.prepared.joints.copy()
+    start, end = views.near[0, :2]
+    joints[end, :, body.roots[1]] = joints[end, :, body.roots[0]]
+    together = views._replace(prepared=views.prepared._replace(joints=joints))
+    for pair in ((start, end), (end, start)):
+        assert transfer(pose, np.ones(len(pose)), 0, *pair, body, together, new) == -np.inf
+    moves, rng = moves_of(body), np.random.default_rng(0)
+    log_prior_terms(pose, body, physics, parts)
+    counters = (moves, np.full(len(moves), 0.1), np.zeros(len(moves)), np.zeros(len(moves)))
+    walk(pose, parts, 0, 0.1, 2000, *counters, body, physics, together, rng)
+    assert np.isfinite(pose).all()
+
+
+def test_a_transfer_leads_from_one_annotation_to_the_other(prior, likelihood):
+    """A pose whose bones lie on the first annotation's comes to lie on the second's."""
+    body, _, views = pair_arrays(MotionPosterior(prior, likelihood))
+    rng, done = np.random.default_rng(0), 0
+    for number in range(30):
+        view, start, end = number % 5, *views.near[number % 5, :2]
+        pose = prior.seed[0] + 0.02 * rng.standard_normal(prior.seed[0].shape)
+        near, new, nearer = (np.empty_like(pose) for _ in range(3))
+        if approach(pose, -1, 1e-4, view, start, body, views, near) == -np.inf:
+            continue
+        towards = image_axes(pose, view, body, views)[2]
+        sides = np.sign((near - near[body.parents]) @ np.array(towards))
+        transfer(near, sides, view, start, end, body, views, new)
+        if approach(new, -1, 0.5, view, end, body, views, nearer) == -np.inf:
+            continue
+        done += 1
+        np.testing.assert_allclose(nearer, new, atol=1e-3)
+        assert np.abs(new - near).max() > 0.05
+    assert done > 5
+
+
 def test_walk_updates_its_terms_correctly(prior, likelihood):
     """Incrementally updated terms equal recomputed ones."""
     body, physics, views = pair_arrays(MotionPosterior(prior, likelihood))
@@ -255,6 +320,50 @@ def test_walk_samples_the_tempered_density(prior, likelihood, exact):
         poses, chosen = zip(*states[100:], strict=True)
         summaries.append(summary(np.array(poses))[np.arange(len(chosen)), list(chosen)])
     assert np.abs(_z_scores(np.array(summaries), mean, error)).max() < _MAX_Z
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [0.15, 0.3])
+def test_transfers_preserve_the_tempered_density(prior, likelihood, exact, noise):
+    """Expectations of weighted draws do not change, although many of the draws do.
+
+    With less noise, annotations differ more in probability; with more, more draws count.
+    """
+    weak_prior, power = replace(prior, position_noise=0.7, max_invalid=24), 0.6
+    posterior = MotionPosterior(weak_prior, replace(likelihood, n_near=8, noise=noise))
+    body, physics, views = pair_arrays(posterior)
+    rng, (n_views, n_near), n = np.random.default_rng(0), views.near.shape, len(exact)
+    log_weight = weak_prior.log_plausibility(exact[:, None])
+    summaries, poses = np.empty((2, n, 4)), exact.copy()
+    parts, logs = np.empty(6), np.empty(n_near)
+    workspace = (np.empty_like(poses[0]), np.empty(6), np.empty(n_near))
+
+    def summary(pose: np.ndarray, view: int, logs: np.ndarray) -> list[float]:
+        """Return log L_v, distance of roots, bones near the image plane and annotations in use."""
+        bones = (pose - pose[body.parents])[body.parents >= 0]
+        sines = bones @ image_axes(pose, view, body, views)[2] / np.linalg.norm(bones, axis=1)
+        apart = np.linalg.norm(np.subtract(*pose[body.roots]))
+        in_use = logsumexp(power * (logs - logs.max()))
+        return [logs.max(), apart, np.exp(-((sines / 0.2) ** 2)).mean(), in_use]
+
+    for k, pose in enumerate(poses):
+        view = int(rng.integers(n_views))
+        log_prior_terms(pose, body, physics, parts)
+        log_annotations(pose, view, body, views, logs)
+        log_weight[k] += power * logs.max()
+        summaries[0, k] = summary(pose, view, logs)
+        for _ in range(20):
+            pair_walk_kernels._propose_transfer(
+                pose, parts, logs, view, power, body, physics, views, *workspace, rng
+            )
+        summaries[1, k] = summary(pose, view, logs)
+    weight = np.exp(log_weight - log_weight.max())
+    weight /= weight.sum()
+    moved = (poses != exact).any(axis=(1, 2))
+    assert weight[moved].sum() ** 2 / (weight[moved] ** 2).sum() > 300
+    change = summaries[1] - summaries[0]
+    z = weight @ change / np.sqrt(weight**2 @ change**2)
+    assert np.abs(z).max() < _MAX_Z
 
 
 @pytest.mark.slow

@@ -1,0 +1,219 @@
+"""Compiled proposals that move pose pairs towards, or between, annotations of a view."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from probmotion.extras import numba
+from probmotion.models.pose_pairs.joint_limits_frames import from_frame, least_rotation
+from probmotion.models.pose_pairs.pair_densities import Vector, ViewAnnotations, image_axes
+from probmotion.models.pose_pairs.pair_moves import Body
+
+__all__ = ["approach", "draw_sides", "log_side_probability", "scaled_depths", "transfer"]
+
+_SIDE_SCALE = 0.2
+"""Sine of a bone's angle to the image plane at which its own side has probability .73."""
+_MAX_SCALE = 100.0
+"""Maximum ratio of the distances between two roots in two annotations."""
+
+
+@numba.njit(cache=True, nogil=True)
+def approach(
+    pose: np.ndarray,
+    root: int,
+    ratio: float,
+    view: int,
+    annotation: int,
+    body: Body,
+    views: ViewAnnotations,
+    proposed: np.ndarray,
+) -> float:
+    """Move bones towards or away from those of an annotation; return the log ratio of volumes.
+
+    The angle of each bone of a person, or of all people if ``root`` is −1, to the annotation's bone
+    is multiplied by ``ratio``. That bone has the length of the pose's and is on the same side of
+    the image plane, or in it if it is too long. The inverse move has the ratio 1/``ratio``; −∞ if
+    there is none, because a bone would change sides. The annotation is rotated in the image to fit
+    the joints that define the local frame. Their bones stay, so the view and the
+    rotation stay too.
+    """
+    right, up, towards = image_axes(pose, view, body, views)
+    joints, n_joints = views.prepared.joints[annotation], len(pose)
+    image = _image(pose, right, up)
+    cosine, sine = _rotation_to_frame(image, joints, body)
+    log_volume = 0.0
+    proposed[:] = pose
+    for joint in range(n_joints):
+        parent = body.parents[joint]
+        if body.framing[joint] or parent < 0:
+            continue
+        bone = pose[joint] - pose[parent]
+        if root < 0 or body.below[root, joint]:
+            x = image[0, joint] - image[0, parent]
+            y = image[1, joint] - image[1, parent]
+            z = _component(bone, towards)
+            u, v = joints[0, joint] - joints[0, parent], joints[1, joint] - joints[1, parent]
+            length = np.sqrt((bone**2).sum())
+            goal = _lifted(cosine * u - sine * v, sine * u + cosine * v, z, length)
+            (x, y, new_z), log_area = _scaled_angle((x, y, z), goal, ratio)
+            if log_area == -np.inf or (new_z > 0) != (z > 0):
+                return -np.inf
+            log_volume += log_area
+            for axis in range(3):
+                bone[axis] = x * right[axis] + y * up[axis] + new_z * towards[axis]
+        proposed[joint] = proposed[parent] + bone
+    return log_volume
+
+
+@numba.njit(cache=True, nogil=True)
+def transfer(
+    pose: np.ndarray,
+    sides: np.ndarray,
+    view: int,
+    start: int,
+    end: int,
+    body: Body,
+    views: ViewAnnotations,
+    proposed: np.ndarray,
+) -> float:
+    """Move a pose from annotation ``start`` to ``end``; return the log ratio of volumes.
+
+    Each bone is turned by the least rotation from the first annotation's bone to the second's. Both
+    have the length of the pose's bone and lie on the given side of the image plane, ``sides`` (J,),
+    −1 or 1, or in it if they are too long. Distances to the first root are scaled as in the
+    annotations. As in :func:`approach`, the local frame and its bones stay. The inverse exchanges
+    the annotations and keeps the sides; −∞ if roots of an annotation (almost) coincide.
+    """
+    right, up, towards = image_axes(pose, view, body, views)
+    old, new, n_joints = views.prepared.joints[start], views.prepared.joints[end], len(pose)
+    cosine, sine = _rotation_to_frame(_image(pose, right, up), old, body)
+    first, log_volume = body.roots[0], 0.0
+    proposed[:] = pose
+    for root in body.roots[1:]:
+        before, after = _distance(old, first, root), _distance(new, first, root)
+        if before == 0 or after > _MAX_SCALE * before or before > _MAX_SCALE * after:
+            return -np.inf
+        scale = after / before
+        log_volume += 3.0 * np.log(scale)
+        for joint in range(n_joints):
+            if body.below[root, joint]:
+                proposed[joint] += (scale - 1.0) * (pose[root] - pose[first])
+    new_cosine, new_sine = _rotation_to_frame(_image(proposed, right, up), new, body)
+    for joint in range(n_joints):
+        parent, side = body.parents[joint], sides[joint]
+        if body.framing[joint] or parent < 0:
+            continue
+        bone = pose[joint] - pose[parent]
+        length = np.sqrt((bone**2).sum())
+        u, v = old[0, joint] - old[0, parent], old[1, joint] - old[1, parent]
+        start_bone = _lifted(cosine * u - sine * v, sine * u + cosine * v, side, length)
+        u, v = new[0, joint] - new[0, parent], new[1, joint] - new[1, parent]
+        x, y = new_cosine * u - new_sine * v, new_sine * u + new_cosine * v
+        turn = least_rotation(start_bone, _lifted(x, y, side, length))
+        vector = (_component(bone, right), _component(bone, up), _component(bone, towards))
+        x, y, z = from_frame(turn, vector)
+        for axis in range(3):
+            bone[axis] = x * right[axis] + y * up[axis] + z * towards[axis]
+        proposed[joint] = proposed[parent] + bone
+    return log_volume
+
+
+@numba.njit(cache=True, nogil=True)
+def draw_sides(depths: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Draw a side of the image plane for each bone, given its :func:`scaled_depths`."""
+    sides = np.empty_like(depths)
+    for joint in range(len(depths)):
+        sides[joint] = 1.0 if rng.random() * (1.0 + np.exp(-depths[joint])) < 1.0 else -1.0
+    return sides
+
+
+@numba.njit(cache=True, nogil=True)
+def log_side_probability(sides: np.ndarray, depths: np.ndarray) -> float:
+    """Return the log probability that :func:`draw_sides` draws ``sides``."""
+    return -np.log1p(np.exp(-sides * depths)).sum()
+
+
+@numba.njit(cache=True, nogil=True)
+def scaled_depths(pose: np.ndarray, view: int, body: Body, views: ViewAnnotations) -> np.ndarray:
+    """Return sin φ / _SIDE_SCALE, φ the angle of bone and image plane, (J,); 0 for roots."""
+    _, _, towards = image_axes(pose, view, body, views)
+    depths = np.zeros(len(pose))
+    for joint in range(len(pose)):
+        parent = body.parents[joint]
+        if parent >= 0:
+            bone = pose[joint] - pose[parent]
+            depths[joint] = _component(bone, towards) / np.sqrt((bone**2).sum()) / _SIDE_SCALE
+    return depths
+
+
+@numba.njit(cache=True, nogil=True)
+def _image(pose: np.ndarray, right: Vector, up: Vector) -> np.ndarray:
+    """Return the joints in the image plane, (2, J)."""
+    image = np.empty((2, len(pose)))
+    for joint in range(len(pose)):
+        image[0, joint] = _component(pose[joint], right)
+        image[1, joint] = _component(pose[joint], up)
+    return image
+
+
+@numba.njit(cache=True, nogil=True)
+def _rotation_to_frame(image: np.ndarray, joints: np.ndarray, body: Body) -> tuple[float, float]:
+    """Return cosine and sine of an annotation's least-squares rotation to an image.
+
+    Only the joints that define the local frame are used.
+    """
+    middle, target, along, across = np.zeros(2), np.zeros(2), 0.0, 0.0
+    for joint in range(image.shape[1]):
+        if body.framing[joint]:
+            for axis in range(2):
+                middle[axis] += image[axis, joint] / body.framing.sum()
+                target[axis] += joints[axis, joint] / body.framing.sum()
+    for joint in range(image.shape[1]):
+        if body.framing[joint]:
+            x, y = image[0, joint] - middle[0], image[1, joint] - middle[1]
+            u, v = joints[0, joint] - target[0], joints[1, joint] - target[1]
+            along += u * x + v * y
+            across += u * y - v * x
+    size = np.sqrt(along * along + across * across)
+    return (along / size, across / size) if size > 0 else (1.0, 0.0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _distance(joints: np.ndarray, first: int, second: int) -> float:
+    """Return the distance between two joints of an annotation (2, J)."""
+    return np.hypot(joints[0, first] - joints[0, second], joints[1, first] - joints[1, second])
+
+
+@numba.njit(cache=True, nogil=True)
+def _component(vector: np.ndarray, axis: Vector) -> float:
+    return vector[0] * axis[0] + vector[1] * axis[1] + vector[2] * axis[2]
+
+
+@numba.njit(cache=True, nogil=True)
+def _lifted(x: float, y: float, side: float, length: float) -> Vector:
+    """Return the direction of a bone of given image and length; ``side`` is its depth's sign."""
+    x, y = x / length, y / length
+    square = x * x + y * y
+    if square >= 1.0:
+        return x / np.sqrt(square), y / np.sqrt(square), 0.0
+    return x, y, np.copysign(np.sqrt(1.0 - square), side)
+
+
+@numba.njit(cache=True, nogil=True)
+def _scaled_angle(vector: Vector, goal: Vector, ratio: float) -> tuple[Vector, float]:
+    """Return a vector with its angle to a direction scaled, and the log ratio of solid angles."""
+    length = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
+    x, y, z = vector[0] / length, vector[1] / length, vector[2] / length
+    cosine = x * goal[0] + y * goal[1] + z * goal[2]
+    x, y, z = x - cosine * goal[0], y - cosine * goal[1], z - cosine * goal[2]
+    sine = np.sqrt(x * x + y * y + z * z)
+    angle = ratio * np.arctan2(sine, cosine)
+    if sine < 1e-12 or angle >= np.pi:
+        return vector, -np.inf
+    along, across = length * np.cos(angle), length * np.sin(angle) / sine
+    new = (
+        along * goal[0] + across * x,
+        along * goal[1] + across * y,
+        along * goal[2] + across * z,
+    )
+    return new, np.log(ratio * np.sin(angle) / sine)
