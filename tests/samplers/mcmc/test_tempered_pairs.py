@@ -12,7 +12,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from arviz_stats.base import array_stats
-from scipy.special import logsumexp
+from scipy.special import log_softmax, logsumexp
 
 from probmotion import MotionPosterior
 from probmotion.data.synthetic.dances import synthetic_dances
@@ -262,6 +262,17 @@ def test_a_transfer_leads_from_one_annotation_to_the_other(prior, likelihood):
         np.testing.assert_allclose(nearer, new, atol=1e-3)
         assert np.abs(new - near).max() > 0.05
     assert done > 5
+
+
+def test_ratio_of_annotations_has_their_probabilities():
+    """The ratio is that of L_v^power, the largest of the likelihoods, times P(annotation)."""
+    old, new = np.random.default_rng(0).normal(-5.0, 3.0, (2, 6))
+
+    def log_joint(logs: np.ndarray, chosen: int) -> float:
+        return 0.7 * logs.max() + log_softmax(0.7 * logs)[chosen]
+
+    expected = log_joint(new, 4) - log_joint(old, 1)
+    assert pair_walk_kernels._log_ratio(old, new, 1, 4, 0.7) == pytest.approx(expected)
 
 
 def test_walk_updates_its_terms_correctly(prior, likelihood):
