@@ -142,7 +142,7 @@ def judge(statistics: Sequence[DrawStatistics]) -> Verdict:
     proportions = pooled(lambda run: list(run.modes.values())) if first.modes else np.empty((0, 2))
     if len(first.modes) > 1:
         quantities.append(_modes_quantity(proportions, pooled(lambda run: run.modes_spread), n))
-    # The effective sample size decides, so that some of the runs may have no value.
+    # Runs with few effective draws have no classifier, those with many no reference sets.
     classified = [run for run in statistics if run.classifier]
     if classified:
         accuracy, deviation = map(float, _pooled(classified, lambda run: run.classifier))
