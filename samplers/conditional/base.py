@@ -115,6 +115,7 @@ class ConditionalSampler(IndependentSampler):
         if self.denoiser != "2d" and isinstance(prior, Denoises3D):
             return [VarianceExploding(MotionDenoiser(prior))]
         assert isinstance(prior, Denoises2D)
+        views.warn_of_mirror_images(self.name, elevation, stacklevel=4)
         sets = view_sets(prior, n_views, elevation, rings)
         return [VarianceExploding(pool) for pool in views.pools(prior, sets)]
 

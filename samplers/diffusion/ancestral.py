@@ -6,7 +6,6 @@ the integrator computes the state at the next level.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -17,6 +16,7 @@ from probmotion.samplers.diffusion.guidance import AnyGuidance, can_guide
 from probmotion.samplers.diffusion.integrators import AnyIntegrator, SecondOrderSDE, Transition
 from probmotion.samplers.diffusion.noise_levels import NoiseLevels, check_object
 from probmotion.samplers.diffusion.states import State
+from probmotion.samplers.diffusion.views import warn_of_mirror_images
 from probmotion.samplers.independent import Batches, IndependentSampler
 from probmotion.seeds import NormalStreams
 
@@ -112,12 +112,7 @@ class AncestralSampler(NoiseLevels, IndependentSampler):
         check_integrator(self.integrator, self.schedule.steps)
 
     def _batches(self, posterior: MotionPosterior, seed: int, progress: bool) -> Batches:
-        if getattr(self, "elevation", None) == 0:
-            warnings.warn(
-                f"{self.name} cannot distinguish a motion from its mirror image with elevation 0: "
-                "half of the draws are reflected in depth; use an elevation such as pi/16",
-                stacklevel=3,
-            )
+        warn_of_mirror_images(self.name, getattr(self, "elevation", None), stacklevel=3)
         state, options = self._state(posterior), self._options()
 
         def draw(streams: NormalStreams, tick: Callable[[], Any]) -> np.ndarray:

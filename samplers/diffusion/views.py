@@ -7,6 +7,7 @@ motions are in normalised units.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from functools import cached_property
 
@@ -19,11 +20,15 @@ from probmotion.posteriors.protocols import (
     Denoises2D,
     Denoises3D,
 )
+from probmotion.validation import check_count
 
 __all__ = [
     "MotionDenoiser", "MultiViewDenoiser", "StateDenoiser", "Views", "pools", "symmetric_power",
-    "view_sets", "views_around",
+    "view_sets", "views_around", "warn_of_mirror_images",
 ]  # fmt: skip
+
+_MIN_EXTENT = 1e-6
+"""Smallest eigenvalue of M relative to its largest; below, errors of views grow a thousandfold."""
 
 
 class Views:
@@ -64,6 +69,14 @@ class Views:
 
     @cached_property
     def _combine_axes(self) -> np.ndarray:
+        extent = np.linalg.eigvalsh(self.gram)
+        if extent[0] < _MIN_EXTENT * extent[-1]:
+            elevations = ", ".join(f"{angle:.3g}" for angle in self.cameras.elevation)
+            raise ValueError(
+                "views must determine all three dimensions, got cameras that look along almost the "
+                f"same line, with elevations {elevations}; use views that differ in azimuth and an "
+                "elevation such as pi/16"
+            )
         weighted = self.weights[:, None, None] * self.axes
         return weighted @ np.linalg.inv(self.gram)
 
@@ -105,6 +118,7 @@ def view_sets(
     five sets of three orthogonal axes, each of which weights all directions equally. A given
     ``elevation`` is that of rings for any prior.
     """
+    check_count("n_views", n_views, least=2)
     elevation = getattr(prior, "view_elevation", None) if elevation is None else elevation
     if elevation is not None:
         turns = np.arange(rings) / (rings * max(3, n_views))
@@ -120,6 +134,16 @@ def view_sets(
         Views(Cameras.around(np.arctan2(x, z), np.arcsin(np.clip(y, -1, 1))))
         for x, y, z in (triad.T for triad in triads)
     ]
+
+
+def warn_of_mirror_images(name: str, elevation: float | None, *, stacklevel: int) -> None:
+    """Warn that a sampler's views at elevation 0 do not distinguish mirror images."""
+    if elevation == 0:
+        warnings.warn(
+            f"{name} cannot distinguish a motion from its mirror image with elevation 0: draws may "
+            "be reflected in depth; use an elevation such as pi/16",
+            stacklevel=stacklevel + 1,
+        )
 
 
 class MotionDenoiser:

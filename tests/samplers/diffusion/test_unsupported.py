@@ -13,16 +13,38 @@ from probmotion.samplers import (
     MultiViewPredictorCorrector,
     ScoreDistillation,
 )
+from probmotion.samplers.conditional import SplitGibbs
 from probmotion.samplers.diffusion.ancestral2d import Ancestral2D
+from probmotion.samplers.diffusion.sync_tweedies import SyncTweedies
 
 
-@pytest.mark.parametrize("kind", [MultiViewAncestral, MultiViewPredictorCorrector])
-def test_elevation_0_warns(gaussian, kind):
-    sampler = kind(steps=3, elevation=0.0)
+@pytest.mark.parametrize(
+    "sampler",
+    [
+        MultiViewAncestral(steps=3, elevation=0.0),
+        MultiViewPredictorCorrector(steps=3, elevation=0.0),
+        SplitGibbs(steps=0, sweeps=1, start_steps=2, particles=2, denoiser="2d", elevation=0.0),
+    ],
+    ids=lambda sampler: sampler.name,
+)
+def test_elevation_0_warns(gaussian, sampler):
+    posterior = MotionPosterior(gaussian, Joints3D(gaussian.mean, noise=0.1))
     message = f"{sampler.name} cannot distinguish a motion from its mirror image with elevation 0"
     with pytest.warns(UserWarning, match=message) as warned:
-        sampler.sample(MotionPosterior(gaussian), draws=1, progress=False)
+        sampler.sample(posterior, draws=1, progress=False)
     assert warned[0].filename == __file__
+
+
+@pytest.mark.parametrize("kind", [MultiViewAncestral, MultiViewPredictorCorrector, SyncTweedies])
+def test_views_that_leave_a_dimension_open_are_refused(gaussian, kind):
+    sampler = kind(steps=3, elevation=np.pi / 2)
+    with pytest.raises(ValueError, match=r"determine all three dim.* elevations 1\.57, 1\.57"):
+        sampler.sample(MotionPosterior(gaussian), draws=1, progress=False)
+
+
+def test_one_view_is_refused(gaussian):
+    with pytest.raises(ValueError, match="n_views must be an integer of at least 2, got 1"):
+        SyncTweedies(steps=3, n_views=1).sample(MotionPosterior(gaussian), draws=1, progress=False)
 
 
 def test_likelihoods_that_are_not_linear_gaussian_are_refused(gaussian):
