@@ -15,10 +15,8 @@ import numpy as np
 
 from probmotion.arrays import Array
 from probmotion.geometry.cameras import Cameras
-from probmotion.models.mixture.gaussian_mixture import GaussianMixtureMotion
 from probmotion.models.mixture.posterior import MixturePosterior
-from probmotion.models.mixture.rotated_mixture import rotation_coefficients
-from probmotion.posteriors.protocols import Likelihood, NotConjugate, OrthographicOnly
+from probmotion.posteriors.protocols import Likelihood, MotionPrior, NotConjugate, OrthographicOnly
 from probmotion.validation import check_shape
 
 __all__ = ["ConditionedMixture"]
@@ -27,35 +25,29 @@ __all__ = ["ConditionedMixture"]
 class ConditionedMixture:
     """Posterior p(X | y) as a prior, with exact E[X₀ | X_t, y] and E[x₀ | x_t, y] for every view.
 
-    θ contains all positions; ``scale`` is the prior's (metres per normalised unit).
+    θ contains all positions.
 
     Parameters
     ----------
-    prior : GaussianMixtureMotion
+    prior : MotionPrior
         Prior p(X).
-    likelihood : Likelihood
-        Likelihood p(y | X).
-
-    Raises
-    ------
-    NotConjugate
-        If the likelihood is not linear in the positions with Gaussian noise.
+    posterior : MixturePosterior
+        Posterior p(X | y).
+    scale : float
+        Metres per normalised unit.
     """
 
-    def __init__(self, prior: GaussianMixtureMotion, likelihood: Likelihood) -> None:
-        self.prior = prior
-        self.likelihood = likelihood
+    def __init__(self, prior: MotionPrior, posterior: MixturePosterior, scale: float) -> None:
         self.skeleton = prior.skeleton
         self.frames = prior.frames
         self.fps = prior.fps
-        self.scale = prior.scale
-        self.dim = prior.means[0].size
-        self._posterior = prior.exact_posterior(likelihood)
-        self._turns = rotation_coefficients(prior.yaws)
+        self.scale = scale
+        self.dim = math.prod(posterior.shape)
+        self._posterior = posterior
 
     def motion(self, theta: Array) -> Array:
         """Return the positions at θ: ``(…, dim) → (…, L, J, 3)``, metres."""
-        return theta.reshape(*theta.shape[:-1], *self.prior.means.shape[1:])
+        return theta.reshape(*theta.shape[:-1], *self._posterior.shape)
 
     def sample(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """Return n independent motions, (n, L, J, 3), metres."""
@@ -72,7 +64,7 @@ class ConditionedMixture:
 
     def denoise_motion(self, x_t: np.ndarray, alpha_bar: float) -> np.ndarray:
         """Return E[X₀ | X_t, y]: ``(B, L, J, 3) → (B, L, J, 3)``, normalised units."""
-        check_shape("x_t", x_t, ("B", *self.prior.means.shape[1:]))
+        check_shape("x_t", x_t, ("B", *self._posterior.shape))
         seen = x_t.reshape(len(x_t), -1, 3)
         return self._mean(seen, alpha_bar, np.eye(3)).reshape(x_t.shape)
 
@@ -80,7 +72,7 @@ class ConditionedMixture:
         """Return E[x₀ | x_t, y] for each orthographic view, (B, V, L, J, 2), normalised units."""
         if not cameras.orthographic:
             raise OrthographicOnly("cameras must be orthographic, got perspective")
-        check_shape("x_t", x_t, ("B", cameras.n_views, *self.prior.means.shape[1:3], 2))
+        check_shape("x_t", x_t, ("B", cameras.n_views, *self._posterior.shape[:2], 2))
         out = np.empty_like(x_t)
         for view, axes in enumerate(cameras.image_axes):
             seen = x_t[:, view].reshape(len(x_t), -1, 2)
@@ -89,23 +81,20 @@ class ConditionedMixture:
 
     def _mean(self, seen: np.ndarray, alpha_bar: float, axes: np.ndarray) -> np.ndarray:
         """Return E[X₀ | P X_t, y], ``(B, F, M) → (B, F, 3)``, F = L·J; P is ``axes``, (M, 3)."""
-        prior, scale, variance = self.prior, self.prior.scale, self.prior.noise**2
+        posterior, scale, variance = self._posterior, self.scale, self._posterior.noise**2
         if not 0 < alpha_bar < 1:
             raise ValueError(f"alpha_bar must be between 0 and 1 (exclusive), got {alpha_bar!r}")
         precision = alpha_bar / ((1 - alpha_bar) * scale**2)
-        information = self._posterior.information + precision * axes.T @ axes
+        information = posterior.information + precision * axes.T @ axes
         shrink = np.linalg.inv(np.eye(3) + variance * information)
-        fields = prior.base_fields
+        fields, turns = posterior.fields, posterior.turns
         K, width, _, F, _ = fields.shape
-        turns = self._turns
         flat = fields.reshape(K, width * 3, F * 3)
         weighted = np.einsum("fij,knefj->knefi", shrink @ information, fields, optimize=True)
         gram = (flat @ weighted.reshape(flat.shape).swapaxes(1, 2)).reshape(K, width, 3, width, 3)
         gram = np.einsum("kicjd,ac,ad->kaij", gram, turns, turns, optimize=True)
         # The arrays below have one row per draw.
-        shift = self._posterior.shift + math.sqrt(alpha_bar) / ((1 - alpha_bar) * scale) * (
-            seen @ axes
-        )
+        shift = posterior.shift + math.sqrt(alpha_bar) / ((1 - alpha_bar) * scale) * (seen @ axes)
         shrunk_shift = np.einsum("fij,bfj->bfi", shrink, shift)
         products = shrunk_shift.reshape(len(seen), F * 3) @ flat.reshape(K * width * 3, F * 3).T
         linear = products.reshape(len(seen), K, width, 3) @ turns.T
@@ -118,18 +107,18 @@ class ConditionedMixture:
 
         S is ``shrink``, η ``shift``. ``linear`` is (B, K, A, 1 + r), ``gram`` (K, A, 1 + r, 1 + r).
         """
-        prior = self.prior
-        latent_precision = np.eye(prior.rank) + gram[..., 1:, 1:]
+        posterior = self._posterior
+        latent_precision = np.eye(gram.shape[-1] - 1) + gram[..., 1:, 1:]
         slope = linear[..., 1:] - gram[..., 0, 1:]
         latent = (np.linalg.inv(latent_precision) @ slope[..., None])[..., 0]
-        logits = np.log(prior.weights)[:, None] - 0.5 * gram[..., 0, 0]
+        logits = np.log(posterior.weights)[:, None] - 0.5 * gram[..., 0, 0]
         logits = logits - 0.5 * np.linalg.slogdet(latent_precision)[1]
         logits = logits + linear[..., 0] + 0.5 * (slope * latent).sum(axis=-1)
         weights = np.exp(logits - logits.max(axis=(1, 2), keepdims=True))
         weights /= weights.sum(axis=(1, 2), keepdims=True)
         extended = np.concatenate([np.ones((*latent.shape[:-1], 1)), latent], axis=-1)
-        base = (extended * weights[..., None]).swapaxes(2, 3) @ self._turns
-        fields = prior.base_fields
+        base = (extended * weights[..., None]).swapaxes(2, 3) @ posterior.turns
+        fields = posterior.fields
         clean = base.reshape(len(base), -1) @ fields.reshape(-1, fields[0, 0, 0].size)
-        clean = clean.reshape(shift.shape) + prior.noise**2 * shift
-        return np.einsum("fij,bfj->bfi", shrink, clean) / prior.scale
+        clean = clean.reshape(shift.shape) + posterior.noise**2 * shift
+        return np.einsum("fij,bfj->bfi", shrink, clean) / self.scale

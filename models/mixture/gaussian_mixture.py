@@ -17,6 +17,7 @@ import numpy as np
 
 from probmotion.arrays import Array, array_namespace
 from probmotion.geometry.cameras import Cameras
+from probmotion.models.mixture.conditioned_mixture import ConditionedMixture
 from probmotion.models.mixture.fit import fit_styles
 from probmotion.models.mixture.posterior import MixturePosterior
 from probmotion.models.mixture.rotated_mixture import RotatedMixture, rotation_fields
@@ -255,6 +256,16 @@ class GaussianMixtureMotion:
             posterior = MixturePosterior(*parameters, self.means.shape[1:], likelihood)
             self._posteriors[key] = posterior
         return self._posteriors[key]
+
+    def given(self, likelihood: Likelihood) -> ConditionedMixture:
+        """Return p(X | y) as a prior with exact denoisers.
+
+        Raises
+        ------
+        NotConjugate
+            If the likelihood is not linear in the positions with Gaussian noise.
+        """
+        return ConditionedMixture(self, self.exact_posterior(likelihood), self.scale)
 
     def denoise(self, x_t: np.ndarray, alpha_bar: float, cameras: Cameras) -> np.ndarray:
         """Return E[x₀ | x_t] for each view, arrays (B, V, L, J, 2), normalised units.

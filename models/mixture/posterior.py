@@ -40,8 +40,9 @@ class MixturePosterior:
     ) -> None:
         self.shape = shape
         self.noise = noise
-        self._fields = base_fields
-        self._turns = rotation_coefficients(azimuths)
+        self.weights = weights
+        self.fields = base_fields
+        self.turns = rotation_coefficients(azimuths)
         self.information, self.shift, constant_part = natural_parameters(
             likelihood, base_fields.shape[3]
         )
@@ -51,7 +52,7 @@ class MixturePosterior:
         shrunk_shift = np.einsum("fij,fj->fi", self._shrink, self.shift)
         weighted = np.einsum("fij,knefj->knefi", metric, base_fields)
         gram = np.einsum("kicfx,kjdfx->kijcd", base_fields, weighted, optimize=True)
-        turns = self._turns
+        turns = self.turns
         self._gram = np.einsum("kijcd,ac,ad->kaij", gram, turns, turns, optimize=True)
         linear = np.einsum("fx,kicfx->kic", shrunk_shift, base_fields, optimize=True)
         self._linear = np.einsum("kic,ac->kai", linear, turns)
@@ -104,8 +105,8 @@ class MixturePosterior:
         """Return E[X | y], (L, J, 3), metres."""
         weights = self.component_probabilities
         latent = np.concatenate([np.ones((*weights.shape, 1)), self._latent_mean], axis=-1)
-        base = np.einsum("ka,kai,ac->kic", weights, latent, self._turns, optimize=True)
-        clean = np.einsum("kic,kicfx->fx", base, self._fields, optimize=True)
+        base = np.einsum("ka,kai,ac->kic", weights, latent, self.turns, optimize=True)
+        clean = np.einsum("kic,kicfx->fx", base, self.fields, optimize=True)
         return self._given_clean(clean).reshape(self.shape)
 
     def sample(self, rng: np.random.Generator, n: int) -> np.ndarray:
@@ -135,8 +136,8 @@ class MixturePosterior:
     def log_density(self, positions: Array) -> Array:
         """Return log p(X | y), normalised: ``(…, L, J, 3) → (…)``; NumPy, torch or JAX."""
         xp = array_namespace(positions)
-        K, width, _, F, _ = self._fields.shape
-        A = len(self._turns)
+        K, width, _, F, _ = self.fields.shape
+        A = len(self.turns)
         n = math.prod(positions.shape[:-3])
         flat = xp.reshape(positions, (n, F, 3))
         # Given (k, a), X is Gaussian with precision Q = Λ + I/δ² around the latent subspace.
@@ -144,9 +145,9 @@ class MixturePosterior:
         precision = self.information + np.eye(3) / self.noise**2
         weighted = xp.sum(constant(precision, flat) * centred[:, :, None, :], axis=-1)
         square = xp.sum(weighted * centred, axis=(-2, -1))
-        shrunk = np.einsum("fxy,kicfy->kicfx", self._shrink, self._fields)
+        shrunk = np.einsum("fxy,kicfy->kicfx", self._shrink, self.fields)
         products = xp.reshape(weighted, (n, F * 3)) @ constant(shrunk.reshape(-1, F * 3).T, flat)
-        rotated = xp.reshape(products, (n, K, width, 3)) @ constant(self._turns.T, flat)
+        rotated = xp.reshape(products, (n, K, width, 3)) @ constant(self.turns.T, flat)
         rotated = xp.permute_dims(rotated, (0, 1, 3, 2))
         gram = self._clean_gram
         slope = rotated[..., 1:] - constant(gram[..., 0, 1:], flat)
@@ -167,9 +168,9 @@ class MixturePosterior:
 
         S Q S = S / δ², because S Q = I/δ².
         """
-        shrunk = np.einsum("fxy,kicfy->kicfx", self._shrink, self._fields) / self.noise**2
-        gram = np.einsum("kicfx,kjdfx->kijcd", self._fields, shrunk, optimize=True)
-        return np.einsum("kijcd,ac,ad->kaij", gram, self._turns, self._turns, optimize=True)
+        shrunk = np.einsum("fxy,kicfy->kicfx", self._shrink, self.fields) / self.noise**2
+        gram = np.einsum("kicfx,kjdfx->kijcd", self.fields, shrunk, optimize=True)
+        return np.einsum("kijcd,ac,ad->kaij", gram, self.turns, self.turns, optimize=True)
 
     def _log_terms(self, latent: Array) -> Array:
         """Return log p(k, a) p(y | z, k, a), ``(…, r) → (…, K·A)``."""
@@ -198,10 +199,10 @@ class MixturePosterior:
     ) -> np.ndarray:
         """Draw X given style, azimuth and z, (n, L, J, 3)."""
         n = len(latent)
-        out = np.empty((n, *self._fields.shape[3:]))
+        out = np.empty((n, *self.fields.shape[3:]))
         for row in range(n):
-            weights = np.concatenate([[1.0], latent[row]])[:, None] * self._turns[azimuth[row]]
-            out[row] = np.tensordot(weights, self._fields[style[row]], axes=2)
+            weights = np.concatenate([[1.0], latent[row]])[:, None] * self.turns[azimuth[row]]
+            out[row] = np.tensordot(weights, self.fields[style[row]], axes=2)
         noise = rng.standard_normal(out.shape)
         spread = np.einsum("fij,nfj->nfi", self._noise_root, noise)
         out = self._given_clean(out) + self.noise * spread

@@ -24,7 +24,6 @@ from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.problem import Problem
 from probmotion.posteriors.sampling import Sampler
 from probmotion.problems import load_problem
-from probmotion.problems.conditioned import conditioned
 from probmotion.samplers import (
     NUTS,
     Ancestral3D,
@@ -40,6 +39,7 @@ from probmotion.samplers.diffusion import (
     DDPM,
     DPS,
     Cosine,
+    ExactGuidance,
     Heun,
     Karras,
     LogSNR,
@@ -90,16 +90,6 @@ class MirroredSampler(ExactSampler):
         return Batches(draw, size=1)
 
 
-@dataclass(frozen=True)
-class ExactlyGuided(Ancestral3D):
-    """Diffusion sampling with the exact denoiser of the posterior, without error of guidance."""
-
-    name: ClassVar[str] = "exactly-guided"
-
-    def _batches(self, posterior: MotionPosterior, seed: int, progress: bool) -> Batches:
-        return super()._batches(conditioned(posterior), seed, progress)
-
-
 def conditional_methods(budget: int) -> dict[str, Sampler]:
     """Return methods of conditioning 2D denoisers, at a number of evaluations a draw."""
     # Exact denoisers have three views at a time, those of `mas` five.
@@ -142,7 +132,7 @@ STUDIES = {
         {
             "moment matching": Ancestral3D(),
             "moment matching, 6 steps": Ancestral3D(guidance=MomentMatched()),
-            "exact": ExactlyGuided(),
+            "exact": Ancestral3D(guidance=ExactGuidance()),
         },
     ),
     "elevations": Study(

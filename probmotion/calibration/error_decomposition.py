@@ -32,7 +32,6 @@ from probmotion.posteriors.posterior import MotionPosterior
 from probmotion.posteriors.problem import Problem
 from probmotion.posteriors.protocols import MotionPrior
 from probmotion.posteriors.sampling import Sampler, load_sampler, progress_bar, require
-from probmotion.problems.conditioned import conditioned
 from probmotion.validation import check_count
 
 __all__ = ["decompose_error"]
@@ -144,7 +143,7 @@ def _chain(
     Ancestral, Mas = load_sampler("ancestral3d"), load_sampler("mas")
     batch = {name: settings[name] for name in ("batch",) if name in settings}
     likelihood = problem.posterior.likelihood
-    inside = conditioned(problem.posterior)
+    inside = problem.posterior.conditioned()
     shared = likelihood is not None if shared_noise is None else shared_noise
     if likelihood is not None and not shared:
         raise ValueError(

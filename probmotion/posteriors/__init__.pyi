@@ -13,6 +13,7 @@ from .protocols import (
     Denoises3D as Denoises3D,
     DenoisesCoordinates as DenoisesCoordinates,
     ExactPosterior as ExactPosterior,
+    HasConditional as HasConditional,
     HasCoordinateSpeeds as HasCoordinateSpeeds,
     HasExactPosterior as HasExactPosterior,
     HasInferenceNetwork as HasInferenceNetwork,

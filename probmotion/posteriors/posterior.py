@@ -13,6 +13,7 @@ from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.protocols import (
     ChecksObservations,
     ComparesViews,
+    HasConditional,
     HasCoordinateSpeeds,
     HasLogDensity,
     Likelihood,
@@ -108,6 +109,25 @@ class MotionPosterior:
     def truncated(self) -> bool:
         """Whether the density is truncated (:class:`TruncatedPosterior`)."""
         return False
+
+    def conditioned(self) -> MotionPosterior:
+        """Return this posterior as a prior without likelihood, with exact denoisers.
+
+        Raises
+        ------
+        ValueError
+            If there are observations, but the prior has no ``given``.
+        NotConjugate
+            If the observations are not linear in the positions with Gaussian noise.
+        """
+        if self.likelihood is None:
+            return self
+        if not isinstance(self.prior, HasConditional):
+            raise ValueError(
+                "prior must have given(likelihood) for exact denoisers of the posterior, got "
+                f"{type(self.prior).__name__}"
+            )
+        return MotionPosterior(self.prior.given(self.likelihood))
 
     def log_density(self, theta: Array) -> Array:
         """Return log p(θ) + log p(y | θ), unnormalised: ``(…, dim) → (…)``.

@@ -25,6 +25,7 @@ __all__ = [
     "Denoises3D",
     "DenoisesCoordinates",
     "ExactPosterior",
+    "HasConditional",
     "HasCoordinateSpeeds",
     "HasExactPosterior",
     "HasInferenceNetwork",
@@ -383,3 +384,11 @@ class HasExactPosterior(Protocol):
 
     def exact_posterior(self, likelihood: Likelihood | None) -> ExactPosterior:
         """Return p(X | y); raise `NotConjugate` unless y is linear in X with Gaussian noise."""
+
+
+@runtime_checkable
+class HasConditional(Protocol):
+    """A prior that can be conditioned on observations, with exact denoisers of the posterior."""
+
+    def given(self, likelihood: Likelihood) -> MotionPrior:
+        """Return p(X | y) as a prior; raise `NotConjugate` as ``exact_posterior`` does."""

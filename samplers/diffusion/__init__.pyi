@@ -3,6 +3,7 @@ from .ancestral3d import Ancestral3D as Ancestral3D
 from .guidance import (
     DPS as DPS,
     AnyGuidance as AnyGuidance,
+    ExactGuidance as ExactGuidance,
     MomentMatched as MomentMatched,
     Replacement as Replacement,
     WeightedTriangulation as WeightedTriangulation,

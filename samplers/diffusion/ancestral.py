@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from probmotion.posteriors.posterior import MotionPosterior
-from probmotion.samplers.diffusion.guidance import AnyGuidance, can_guide
+from probmotion.samplers.diffusion.guidance import AnyGuidance, ExactGuidance, can_guide
 from probmotion.samplers.diffusion.integrators import AnyIntegrator, SecondOrderSDE, Transition
 from probmotion.samplers.diffusion.noise_levels import NoiseLevels, check_object
 from probmotion.samplers.diffusion.states import State
@@ -113,7 +113,7 @@ class AncestralSampler(NoiseLevels, IndependentSampler):
 
     def _batches(self, posterior: MotionPosterior, seed: int, progress: bool) -> Batches:
         warn_of_mirror_images(self.name, getattr(self, "elevation", None), stacklevel=3)
-        state, options = self._state(posterior), self._options()
+        state, options = self._state(self._target(posterior)), self._options()
 
         def draw(streams: NormalStreams, tick: Callable[[], Any]) -> np.ndarray:
             return ancestral(state, streams, tick, self.integrator, **options)
@@ -121,6 +121,12 @@ class AncestralSampler(NoiseLevels, IndependentSampler):
         steps = self.steps - options.get("stop", 1) + 1
         scale = posterior.prior.scale  # type: ignore[attr-defined]
         return Batches(draw, self.batch, steps, scale, state.counts)
+
+    def _target(self, posterior: MotionPosterior) -> MotionPosterior:
+        """Return the posterior, with exact guidance as a prior."""
+        if isinstance(self.guidance, ExactGuidance):
+            return self.guidance.condition(self, posterior)
+        return posterior
 
     def _state(self, posterior: MotionPosterior) -> State:
         raise NotImplementedError

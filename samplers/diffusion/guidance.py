@@ -13,14 +13,14 @@ import numpy as np
 
 from probmotion.posteriors.noise_schedule import PosteriorStep
 from probmotion.posteriors.posterior import MotionPosterior
-from probmotion.posteriors.protocols import NotConjugate
+from probmotion.posteriors.protocols import HasConditional, NotConjugate
 from probmotion.posteriors.sampling import Sampler, UnsupportedPosterior, suited
 from probmotion.samplers.diffusion.views import StateDenoiser, symmetric_power
 from probmotion.validation import check_count, check_positive
 
 __all__ = [
-    "DPS", "AnyGuidance", "Guide", "LinearObservations", "LinearisedObservations", "MomentMatched",
-    "Replacement", "WeightedTriangulation", "can_guide", "guide_towards",
+    "DPS", "AnyGuidance", "ExactGuidance", "Guide", "LinearObservations", "LinearisedObservations",
+    "MomentMatched", "Replacement", "WeightedTriangulation", "can_guide", "guide_towards",
 ]  # fmt: skip
 
 _ROWS = 64  # covariances of more rows would take hundreds of megabytes
@@ -288,6 +288,31 @@ class WeightedTriangulation:
         return _least_squares(observations, weight, inverse)
 
 
+@dataclass(frozen=True)
+class ExactGuidance:
+    """Exact denoiser of the posterior, from a prior with ``given(likelihood)``.
+
+    The reference for other methods: with it, a sampler has no error of guidance. Networks cannot be
+    conditioned in this way.
+    """
+
+    kind: str = field(default="exact", init=False)
+
+    def condition(self, sampler: Sampler, posterior: MotionPosterior) -> MotionPosterior:
+        """Return the posterior as a prior; raise :class:`UnsupportedPosterior` if impossible."""
+        if posterior.likelihood is None:
+            return posterior
+        LinearObservations.of(sampler, posterior)
+        if not isinstance(posterior.prior, HasConditional):
+            raise UnsupportedPosterior(
+                sampler.name,
+                "with guidance exact requires a prior that can be conditioned, by "
+                f"given(likelihood), got {type(posterior.prior).__name__}; use another guidance",
+                word="HasConditional",
+            )
+        return posterior.conditioned()
+
+
 def _least_squares(
     observations: LinearObservations, weight: np.ndarray, inverse: np.ndarray
 ) -> Guide:
@@ -302,7 +327,7 @@ def _least_squares(
     return guide
 
 
-AnyGuidance = MomentMatched | DPS | Replacement | WeightedTriangulation
+AnyGuidance = MomentMatched | DPS | Replacement | WeightedTriangulation | ExactGuidance
 
 
 def guide_towards(
@@ -315,6 +340,7 @@ def guide_towards(
     """
     if posterior.likelihood is None:
         return None
+    assert not isinstance(guidance, ExactGuidance)  # Its posteriors have no likelihood.
     observations = LinearObservations.of(sampler, posterior)
     protocol = denoiser.covariance_protocol
     if isinstance(guidance, MomentMatched | DPS) and not isinstance(posterior.prior, protocol):

@@ -125,7 +125,7 @@ class MultiViewAncestral(AncestralSampler):
         require(self, posterior)
         if not self.shared_noise:
             raise ValueError("shared_noise must be True to compute new views, got False")
-        state = self._state(posterior)
+        state = self._state(self._target(posterior))
         steps: list[Transition] = []
         noises: list[np.ndarray] = []
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -55,6 +55,10 @@ class GaussianMotion:
             shift = shift + rows.T @ (weight * y.ravel())
         covariance = np.linalg.inv(information)
         return (covariance @ shift).reshape(self.mean.shape), covariance
+
+    def given(self, likelihood):
+        mean, covariance = self.posterior(likelihood)
+        return replace(self, mean=mean, covariance=covariance)
 
     def denoise_motion(self, x_t, alpha_bar):
         return self._denoise(np.eye(3), x_t, alpha_bar)

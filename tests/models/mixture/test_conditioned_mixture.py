@@ -5,7 +5,6 @@ import pytest
 
 from probmotion import Joints3D, MotionPosterior
 from probmotion.geometry.cameras import Cameras
-from probmotion.models.mixture.conditioned_mixture import ConditionedMixture
 from probmotion.posteriors.protocols import (
     Denoises2D,
     Denoises3D,
@@ -14,7 +13,6 @@ from probmotion.posteriors.protocols import (
     OrthographicOnly,
 )
 from probmotion.problems import load_problem
-from probmotion.problems.conditioned import conditioned
 
 VIEWS = Cameras.ring(2, elevation=0.3)
 
@@ -26,7 +24,7 @@ def posterior():
 
 @pytest.fixture(scope="module")
 def mixture(posterior):
-    return conditioned(posterior).prior
+    return posterior.conditioned().prior
 
 
 class Linear:
@@ -68,7 +66,7 @@ def test_denoisers_match_the_posterior_of_both_observations(posterior, mixture, 
 
 def test_uninformative_likelihood_leaves_the_prior_unchanged(posterior):
     prior = posterior.prior
-    mixture = ConditionedMixture(prior, Joints3D(np.zeros(prior.means.shape[1:]), noise=1e6))
+    mixture = prior.given(Joints3D(np.zeros(prior.means.shape[1:]), noise=1e6))
     x_t = noisy(prior, 0.4)
     np.testing.assert_allclose(
         mixture.denoise_motion(x_t, 0.4), prior.denoise_motion(x_t, 0.4), atol=1e-7
@@ -86,7 +84,7 @@ def test_implements_the_prior_protocols(posterior, mixture):
     exact = posterior.prior.exact_posterior(posterior.likelihood)
     draws = [one.sample(np.random.default_rng(3), 4) for one in (mixture, exact)]
     np.testing.assert_array_equal(*draws)
-    assert conditioned(inner) is inner
+    assert inner.conditioned() is inner
 
 
 def test_invalid_input_is_rejected(posterior, mixture):
@@ -103,7 +101,7 @@ def test_invalid_input_is_rejected(posterior, mixture):
             lambda: mixture.denoise(x_t[..., :2], 0.5, perspective),
         ),
         (NotConjugate, "must be None", lambda: mixture.exact_posterior(posterior.likelihood)),
-        (NotConjugate, "Student-t", lambda: ConditionedMixture(posterior.prior, outliers)),
+        (NotConjugate, "Student-t", lambda: posterior.prior.given(outliers)),
     ):
         with pytest.raises(error, match=message):
             call()

@@ -16,9 +16,11 @@ from probmotion import (
     NoiseSchedule,
     UnsupportedPosterior,
 )
+from probmotion.problems import load_problem
 from probmotion.samplers import Ancestral3D, MultiViewAncestral, MultiViewPredictorCorrector
 from probmotion.samplers.diffusion.guidance import (
     DPS,
+    ExactGuidance,
     LinearisedObservations,
     LinearObservations,
     MomentMatched,
@@ -50,9 +52,7 @@ def keypoints(observations):
 
 def exact_denoiser(prior, likelihood, x_t, alpha_bar):
     """Return E[X₀ | X_t, y] by dense linear algebra."""
-    mean, covariance = prior.posterior(likelihood)
-    posterior = replace(prior, mean=mean, covariance=covariance)
-    return posterior.denoise_motion(x_t, alpha_bar)
+    return prior.given(likelihood).denoise_motion(x_t, alpha_bar)
 
 
 @pytest.mark.parametrize("alpha_bar", [1e-4, 0.3, 0.95])
@@ -99,18 +99,45 @@ def test_guidance_does_not_depend_on_the_rows_at_a_time(gaussian, keypoints, mon
         np.testing.assert_allclose(parts, whole, rtol=1e-12)
 
 
-def test_exactly_guided_draws_are_those_of_the_posterior(gaussian, keypoints):
-    """With exact guidance the steps are those of a sampler with the posterior as its prior."""
-    mean, covariance = gaussian.posterior(keypoints)
-    conditioned = replace(gaussian, mean=mean, covariance=covariance)
+def test_moment_matched_draws_are_those_of_the_posterior(gaussian, keypoints):
+    """For a Gaussian the steps are those of a sampler with the posterior as its prior."""
     guided, direct = (
-        sampler.sample(posterior, draws=40, seed=5, progress=False).flat()
-        for sampler, posterior in (
-            (Ancestral3D(steps=40), MotionPosterior(gaussian, keypoints)),
-            (Ancestral3D(steps=40), MotionPosterior(conditioned)),
+        Ancestral3D(steps=40).sample(posterior, draws=40, seed=5, progress=False).flat()
+        for posterior in (
+            MotionPosterior(gaussian, keypoints),
+            MotionPosterior(gaussian.given(keypoints)),
         )
     )
     np.testing.assert_allclose(guided, direct, atol=1e-8)
+
+
+@pytest.mark.parametrize("kind", [Ancestral3D, MultiViewAncestral, MultiViewPredictorCorrector])
+def test_exactly_guided_draws_are_those_of_the_conditioned_prior(kind):
+    problem = load_problem("gait-sparse", frames=3, components=6, noise=0.1)
+    guided, direct = (
+        sampler.sample(posterior, draws=4, seed=5, progress=False)
+        for sampler, posterior in (
+            (kind(steps=6, guidance=ExactGuidance()), problem.posterior),
+            (kind(steps=6), problem.posterior.conditioned()),
+        )
+    )
+    np.testing.assert_array_equal(guided.flat(), direct.flat())
+    assert guided.counts == direct.counts
+    assert guided.counts.keys() == {"denoiser"}
+
+
+def test_exactly_guided_draws_choose_styles_with_the_probabilities_of_the_posterior():
+    """Moment matching replaces the styles that are left by one Gaussian."""
+    problem = load_problem("gait-sparse")
+    prior, posterior = problem.posterior.prior, problem.posterior
+    exact = prior.exact_posterior(posterior.likelihood).sample(np.random.default_rng(0), 4000)
+    expected = prior.style_responsibilities(exact).mean(axis=0)
+    errors = []
+    for guidance in (ExactGuidance(), MomentMatched()):
+        draws = Ancestral3D(guidance=guidance).sample(posterior, draws=400, progress=False)
+        shares = prior.style_responsibilities(draws.flat()).mean(axis=0)
+        errors.append(0.5 * abs(shares - expected).sum())
+    assert errors[0] < 0.05 < errors[1]
 
 
 def test_default_gamma_depends_on_the_observations(gaussian, keypoints):
@@ -281,7 +308,7 @@ def test_conjugate_gradients_continue_if_the_covariance_is_singular(size):
     np.testing.assert_allclose(solution, [[0.0075, 0.0]], rtol=1e-9)
 
 
-GUIDANCES = [MomentMatched(), DPS(), Replacement(), WeightedTriangulation()]
+GUIDANCES = [MomentMatched(), DPS(), Replacement(), WeightedTriangulation(), ExactGuidance()]
 
 
 @pytest.mark.parametrize("guidance", GUIDANCES, ids=lambda guidance: guidance.kind)
@@ -319,5 +346,7 @@ def test_guidance_by_covariances_needs_a_prior_that_provides_them(gaussian, keyp
             with pytest.raises(UnsupportedPosterior, match=f"that implements {protocol}") as error:
                 sampler(steps=3, guidance=guidance).sample(posterior, draws=1, progress=False)
             assert error.value.word == protocol
+        with pytest.raises(UnsupportedPosterior, match=r"given\(likelihood\), got Plain; use"):
+            sampler(steps=3, guidance=ExactGuidance()).sample(posterior, draws=1, progress=False)
         draws = sampler(steps=3, guidance=Replacement()).sample(posterior, draws=2, progress=False)
         assert "covariance" not in draws.counts

@@ -15,6 +15,7 @@ from probmotion.samplers import (
 )
 from probmotion.samplers.conditional import SplitGibbs
 from probmotion.samplers.diffusion.ancestral2d import Ancestral2D
+from probmotion.samplers.diffusion.guidance import ExactGuidance
 from probmotion.samplers.diffusion.sync_tweedies import SyncTweedies
 
 
@@ -58,9 +59,14 @@ def test_likelihoods_that_are_not_linear_gaussian_are_refused(gaussian):
         (Joints3D(gaussian.mean, 0.1, degrees_of_freedom=3), "Student-t with 3 degrees"),
         (Other(gaussian.mean, 0.1), r"but Other has no method linear\(\)"),
     ):
-        for kind in (Ancestral3D, MultiViewAncestral, MultiViewPredictorCorrector):
+        for sampler in (
+            Ancestral3D(),
+            Ancestral3D(guidance=ExactGuidance()),
+            MultiViewAncestral(),
+            MultiViewPredictorCorrector(),
+        ):
             with pytest.raises(UnsupportedPosterior, match=reason) as refused:
-                kind().sample(MotionPosterior(gaussian, likelihood), draws=1, progress=False)
+                sampler.sample(MotionPosterior(gaussian, likelihood), draws=1, progress=False)
             assert refused.value.word == "observations"
 
 
