@@ -62,6 +62,7 @@ _ANNEALED_FROM = 0.2  # first ρ of the Langevin dynamics, normalised; above, th
 _ANNEALED_TO = 0.7  # last ρ, in σ_y
 _STEP, _FRICTION = 0.7, 0.2  # of the Langevin dynamics, in units of the coupling's deviations
 _END = 0.1  # last noise level of the reverse diffusion, in ρ
+_LEAST_NOISE = 1e-6  # normalised; rounding of ᾱ changes the last noise level by a percent
 _POWER = 5  # of its spacing (Karras et al. 2022, equation 5)
 
 
@@ -150,6 +151,13 @@ class SplitGibbs(ConditionalSampler):
         pools = self._pools(posterior, self.n_views, self.elevation, rings=_RINGS)
         step, observations = self._step(posterior, pools[0])
         start = TwistedDiffusion(steps=self.start_steps, particles=self.particles, levels=_START)
+        scale: float = posterior.prior.scale  # type: ignore[attr-defined]
+        if step.noise < _LEAST_NOISE:
+            raise ValueError(
+                f"noise of the observations must be at least {_LEAST_NOISE * scale:.2g} m, because "
+                f"denoisers do not resolve less, got {step.noise * scale:.2g} m; use a likelihood "
+                "with more noise"
+            )
         shape = (posterior.frames, posterior.skeleton.n_joints, 3)
         one_pool = len(pools) == 1  # estimates of different pools do not extrapolate
 
@@ -162,7 +170,6 @@ class SplitGibbs(ConditionalSampler):
 
         ticks = self.start_steps - 1 + self.steps + self.sweeps
         counts = pools[0].denoiser.counts
-        scale = posterior.prior.scale  # type: ignore[attr-defined]
         return Batches(draw, self.batch, ticks, scale, counts)
 
     def _step(

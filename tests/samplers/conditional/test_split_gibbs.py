@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probmotion import Cameras, Keypoints2D, Motion, MotionPosterior
+from probmotion import Cameras, Joints3D, Keypoints2D, Motion, MotionPosterior
 from probmotion.samplers.conditional import SplitGibbs, twisted, z_steps
 from probmotion.samplers.conditional.coupling import Coupling, Quadratic
 from probmotion.samplers.diffusion.guidance import LinearObservations
@@ -201,6 +201,12 @@ def test_nothing_observed(gaussian, keypoints):
     blank = replace(keypoints, confidence=np.zeros((1, 2, 2)))
     with pytest.raises(ValueError, match="likelihood must contain an observed entry, got none"):
         SplitGibbs().sample(MotionPosterior(gaussian, blank), draws=1, progress=False)
+
+
+def test_noise_below_the_resolution_of_denoisers(gaussian):
+    exact = MotionPosterior(gaussian, Joints3D(gaussian.mean, noise=1e-9))
+    with pytest.raises(ValueError, match=r"noise of the .* at least 7e-07 m.*, got 1e-09 m"):
+        SplitGibbs().sample(exact, draws=1, progress=False)
 
 
 def test_wrong_settings():
