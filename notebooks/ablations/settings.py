@@ -148,9 +148,6 @@ STUDIES = {
                 steps=95, levels=LogSNR(), integrator=SecondOrderSDE(), elevation=0.0
             ),
             "mvpc, elevation 0": MultiViewPredictorCorrector(steps=58, elevation=0.0),
-            "mvpc, elevation 0, gamma 0": MultiViewPredictorCorrector(
-                steps=58, elevation=0.0, gamma=0.0
-            ),
             "mvpc, elevation 11": MultiViewPredictorCorrector(steps=58, elevation=np.pi / 16),
             "mvpc, elevation 35": MultiViewPredictorCorrector(
                 steps=58, elevation=np.arctan(0.5**0.5)

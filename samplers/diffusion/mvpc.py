@@ -67,7 +67,7 @@ class MultiViewPredictorCorrector(AncestralSampler):
         hold for any view, and by default alternate between five sets of three orthogonal views.
     gamma : float, optional
         Exponent γ for σ ≥ ``gamma_from``, at least 0. By default ½ with observations; without, 1
-        for σ < 4 and 0 from there on.
+        for σ < 4 and 0 from there on, and always 0 for views at elevation 0.
     gamma_from : float
         Noise level σ below which γ is 0.
     corrected_from : float
@@ -141,7 +141,7 @@ class MultiViewPredictorCorrector(AncestralSampler):
             return self.gamma
         if observed:
             return 0.5
-        return 1.0 if level < GAMMA_BELOW else 0.0
+        return 1.0 if level < GAMMA_BELOW and self.elevation != 0 else 0.0
 
     def _state(self, posterior: MotionPosterior) -> State:
         prior = posterior.prior

@@ -64,6 +64,8 @@ def test_gamma_by_noise_level():
     assert [sampler.gamma_at(level) for level in levels] == [0, 0, 0, 1, 1, 0, 0]
     guided = [sampler.gamma_at(level, observed=True) for level in levels]
     assert guided == [0, 0, 0, 0.5, 0.5, 0.5, 0.5]
+    level_views = MultiViewPredictorCorrector(elevation=0.0)
+    assert [level_views.gamma_at(level) for level in levels] == [0] * 7
     learnt = MultiViewPredictorCorrector.learnt()
     assert [learnt.gamma_at(level) for level in levels] == [0, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5]
 
