@@ -29,6 +29,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from arviz_stats.base import array_stats
 from image_figures import image_figures
 from lift_figures import lift_figures
 from mixing_figures import mixing_figures
@@ -59,8 +60,10 @@ from probmotion.interaction.geometry.coordinates import align_rigidly
 from probmotion.interaction.regression import ridge_completion
 from probmotion.metrics.coverage import coverage
 from probmotion.models.mixture.denoising import denoise_joints
-from probmotion.models.unseen_depth import AnnotationLifts, AnnotationPrior
+from probmotion.models.pose_pairs import PosePairPrior, penetration_depth
+from probmotion.models.unseen_depth import AnnotationLifts, AnnotationPrior, physical_lifts
 from probmotion.motion.motion import Motion
+from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.likelihoods import Joints3D
 from probmotion.posteriors.sampling import Sampler
 from probmotion.problems.denoising import limb_occlusions
@@ -159,6 +162,41 @@ def lifting_figures(pairs: Pairs) -> Figures:
     synthetic = dances()
     drawn = synthetic.annotated(300)
     yield "dance_coverage_ic", synthetic.coverage(synthetic.fitted(drawn)[1].positions)
+
+
+def physical_figures(pairs: Pairs) -> Figures:
+    """Yield figures of 2000 draws, one of each annotation, with and without the physical prior.
+
+    Lengths of bones are relative to those of the people. ``rhat`` is the median, over 20
+    annotations, of the largest R-hat of a coordinate, with four chains of 40 draws.
+    """
+    prior, drawn = pairs.fitted(pairs.all)[0], pairs.annotated(2000, seed=1)
+    physics = PosePairPrior(pairs.start, Skeleton.preset("pair17"))
+    keypoints, truth = drawn.annotations.keypoints, in_camera(drawn)
+    start = time.perf_counter()
+    informed = physical_lifts(prior, keypoints, physics)[0]
+    yield "informed_pairs_seconds", time.perf_counter() - start
+    gaussian = prior.sample_lifts(keypoints, np.random.default_rng(0), 1)[0]
+    joints, parents = np.array(physics.skeleton.bones).T
+    lengths = [
+        np.linalg.norm(poses[:, joints] - poses[:, parents], axis=-1)
+        for poses in (informed, gaussian, truth)
+    ]
+    for number, (name, poses) in enumerate((("informed", informed), ("gaussian", gaussian))):
+        yield f"{name}_pairs_coverage_ic", pairs.coverage(poses)
+        yield f"{name}_pairs_bone_sd", float(np.log(lengths[number] / lengths[2]).std())
+        depths = penetration_depth(poses, physics.skeleton)
+        yield f"{name}_pairs_penetration_cm", 100 * float(depths.mean())
+        invalid = ~physics.joint_limits.is_valid(poses)
+        yield f"{name}_pairs_invalid_angles", float(invalid.sum(axis=-1).mean())
+        centred = poses - poses.mean(axis=1, keepdims=True)
+        error = np.linalg.norm(centred - truth + truth.mean(axis=1, keepdims=True), axis=-1)
+        yield f"{name}_pairs_error_mm", 1000 * float(error.mean())
+    chains = np.stack(
+        [physical_lifts(prior, keypoints[:20], physics, draws=40, seed=chain) for chain in range(4)]
+    )
+    rhat = array_stats.rhat(chains.reshape(4, 40, -1), chain_axis=0, draw_axis=1)
+    yield "informed_pairs_rhat", float(np.median(rhat.reshape(20, -1).max(axis=1)))
 
 
 def robustness_figures(pairs: Pairs) -> Figures:
@@ -415,6 +453,7 @@ def denoising_windows(folder: Path) -> list[Motion]:
 
 PARTS = {
     "lifting": lifting_figures,
+    "physical": physical_figures,
     "robustness": robustness_figures,
     "completion": completion_figures,
 }

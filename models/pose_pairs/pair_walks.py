@@ -12,7 +12,6 @@ from probmotion.arrays import logsumexp
 from probmotion.interaction.annotated_pairs import AnnotatedPairs
 from probmotion.interaction.annotations.local_frames import chest_joints, joint_roots
 from probmotion.interaction.annotations.views import view_vectors
-from probmotion.models.pose_pairs.joint_limits import JointLimits
 from probmotion.models.pose_pairs.pair_densities import (
     Physics,
     ViewAnnotations,
@@ -23,10 +22,29 @@ from probmotion.models.pose_pairs.pair_densities import (
 )
 from probmotion.models.pose_pairs.pair_moves import Body, moves_of
 from probmotion.models.pose_pairs.pair_walk_kernels import walk
-from probmotion.models.pose_pairs.penetration import capsules_of
 from probmotion.models.pose_pairs.pose_chart import PoseChart
 
-__all__ = ["PairWalks"]
+__all__ = ["PairWalks", "body_of"]
+
+
+def body_of(chart: PoseChart) -> Body:
+    """Return the skeleton and the seed of a chart for compiled code."""
+    skeleton = chart.skeleton
+    below = np.eye(skeleton.n_joints, dtype=bool)
+    for joint in range(skeleton.n_joints):
+        below[list(skeleton.ancestors(joint)), joint] = True
+    roots, chests = np.array(skeleton.roots), np.array(chest_joints(skeleton))
+    return Body(
+        parents=np.array(skeleton.parents, dtype=np.int64),
+        below=below,
+        roots=roots,
+        chests=chests,
+        framing=np.asarray(below[:, chests].any(axis=1)),
+        person=np.searchsorted(roots, joint_roots(skeleton)),
+        seed=chart.seed,
+        bone_noise=chart.bone_noise,
+        root_noise=chart.root_noise,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,40 +56,8 @@ class PairWalks:
     views: ViewAnnotations
 
     @classmethod
-    def of(
-        cls,
-        chart: PoseChart,
-        limits: JointLimits,
-        likelihood: AnnotatedPairs,
-        penetration_weight: float,
-        position_noise: float,
-        max_invalid: int,
-    ) -> PairWalks:
-        """Return the walks of a prior, given its chart, limits and settings, and a likelihood."""
-        skeleton = chart.skeleton
-        below = np.eye(skeleton.n_joints, dtype=bool)
-        for joint in range(skeleton.n_joints):
-            below[list(skeleton.ancestors(joint)), joint] = True
-        roots, chests = np.array(skeleton.roots), np.array(chest_joints(skeleton))
-        body = Body(
-            parents=np.array(skeleton.parents, dtype=np.int64),
-            below=below,
-            roots=roots,
-            chests=chests,
-            framing=np.asarray(below[:, chests].any(axis=1)),
-            person=np.searchsorted(roots, joint_roots(skeleton)),
-            seed=chart.seed,
-            bone_noise=chart.bone_noise,
-            root_noise=chart.root_noise,
-        )
-        physics = Physics(
-            limits.trees,
-            limits.arrays,
-            *capsules_of(skeleton),
-            penetration_weight,
-            position_noise,
-            max_invalid,
-        )
+    def of(cls, body: Body, physics: Physics, likelihood: AnnotatedPairs) -> PairWalks:
+        """Return the walks of a prior with this body and physics, and a likelihood."""
         vectors, prepared = view_vectors(likelihood.views), likelihood.comparer.prepared
         views = ViewAnnotations(vectors, likelihood.near, prepared, likelihood.noise)
         return cls(body, physics, views)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -10,8 +11,10 @@ from probmotion.arrays import Array, to_numpy
 from probmotion.data.pair_sets import check_close_people
 from probmotion.interaction.annotated_pairs import AnnotatedPairs
 from probmotion.models.pose_pairs.joint_limits import JointLimits
-from probmotion.models.pose_pairs.pair_walks import PairWalks
-from probmotion.models.pose_pairs.penetration import penetration_depth
+from probmotion.models.pose_pairs.pair_densities import Physics
+from probmotion.models.pose_pairs.pair_moves import Body
+from probmotion.models.pose_pairs.pair_walks import PairWalks, body_of
+from probmotion.models.pose_pairs.penetration import capsules_of, penetration_depth
 from probmotion.models.pose_pairs.pose_chart import PoseChart
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.protocols import Likelihood
@@ -157,8 +160,24 @@ class PosePairPrior:
         """Return walks over poses and views, or None unless annotations show all joints."""
         if type(likelihood) is not AnnotatedPairs or not likelihood.annotations.visible.all():
             return None
-        settings = self.penetration_weight, self.position_noise, self.max_invalid
-        return PairWalks.of(self.chart, self.joint_limits, likelihood, *settings)
+        return PairWalks.of(self.body, self.physics, likelihood)
+
+    @cached_property
+    def body(self) -> Body:
+        """Skeleton and seed for compiled code."""
+        return body_of(self.chart)
+
+    @cached_property
+    def physics(self) -> Physics:
+        """Joint limits and penetration for compiled code."""
+        return Physics(
+            self.joint_limits.trees,
+            self.joint_limits.arrays,
+            *capsules_of(self.skeleton),
+            self.penetration_weight,
+            self.position_noise,
+            self.max_invalid,
+        )
 
     def invalid_joints(self, pose: np.ndarray) -> list[str]:
         """Return the names of the joints of a pose (J, 3) beyond the limits."""

@@ -222,13 +222,13 @@ class AnnotationPrior:
         n, J = len(images), self.n_joints
         draws, scales = np.empty((n_draws, n, 3 * J)), np.empty((n_draws, n))
         for rows, visible in visibility_groups(images):
-            evidence = self._cells.evidence(images[rows], visible, unknown_scale)
+            evidence = self.cells.evidence(images[rows], visible, unknown_scale)
             bounds = np.cumsum(evidence.weights(), axis=1)
             bounds /= bounds[:, -1:]
             chosen = (rng.random((n_draws, len(rows)))[..., None] >= bounds).sum(axis=-1)
             drawn = np.stack([(chosen == c).any(axis=0) for c in range(bounds.shape[1])], axis=1)
-            for part in self._cells.posteriors(images[rows], visible, evidence, drawn):
-                root = _square_root(self._cells.covariance(part, visible))
+            for part in self.cells.posteriors(images[rows], visible, evidence, drawn):
+                root = _square_root(self.cells.covariance(part, visible))
                 which, at = np.nonzero(chosen[:, part.rows] == part.cell)
                 values = part.mean[at] + rng.standard_normal((len(at), 3 * J)) @ root.T
                 index = part.rows[at]
@@ -250,7 +250,7 @@ class AnnotationPrior:
         images, _ = centred_images(as_keypoints(annotations, self.n_joints))
         result = np.empty(len(images))
         for rows, visible in visibility_groups(images):
-            evidence = self._cells.evidence(images[rows], visible, unknown_scale)
+            evidence = self.cells.evidence(images[rows], visible, unknown_scale)
             result[rows] = logsumexp(evidence.log_density, axis=-1)
         return result
 
@@ -306,7 +306,8 @@ class AnnotationPrior:
             ) from error
 
     @cached_property
-    def _cells(self) -> ViewCells:
+    def cells(self) -> ViewCells:
+        """Gaussians in camera axes, one for each component and view."""
         return ViewCells(self.weights, self.means, self.covariances, self.views, self.noise)
 
     def _lift(self, keypoints: np.ndarray, unknown_scale: bool) -> AnnotationLifts:
@@ -316,14 +317,14 @@ class AnnotationPrior:
         means, squares = np.zeros((n, 3 * J)), np.zeros((n, 3 * J))
         views, scales = np.empty((n, 2)), np.empty(n)
         for rows, visible in visibility_groups(images):
-            evidence = self._cells.evidence(images[rows], visible, unknown_scale)
+            evidence = self.cells.evidence(images[rows], visible, unknown_scale)
             weights = evidence.weights()
-            views[rows] = self._cells.views[weights.argmax(axis=1)]
+            views[rows] = self.cells.views[weights.argmax(axis=1)]
             scales[rows] = (weights * evidence.scale).sum(axis=1)
-            for part in self._cells.posteriors(images[rows], visible, evidence, weights):
+            for part in self.cells.posteriors(images[rows], visible, evidence, weights):
                 at, weight = rows[part.rows], part.weights[:, None]
                 means[at] += weight * part.mean
-                variances = self._cells.variances(part, visible)
+                variances = self.cells.variances(part, visible)
                 squares[at] += weight * (part.mean**2 + variances)
         sd = np.sqrt(np.maximum(squares - means**2, 0.0))
         positions = _in_place(means.reshape(n, 3, J), centres * scales[:, None])

@@ -61,7 +61,7 @@ def decompose_error(
     ----------
     problem : Problem
         Problem with an exact posterior and exact 3D and 2D denoisers, conditional on observations
-        if there are any (:func:`~probmotion.problems.conditioned.conditioned`).
+        if there are any (:meth:`~probmotion.posteriors.posterior.MotionPosterior.conditioned`).
     steps : int
         T, number of denoising steps.
     seeds : int

@@ -116,10 +116,12 @@ class MotionPosterior:
         Raises
         ------
         ValueError
-            If there are observations, but the prior has no ``given``.
+            If there are observations, but the prior has no ``given``, or the density is truncated.
         NotConjugate
             If the observations are not linear in the positions with Gaussian noise.
         """
+        if self.truncated:
+            raise ValueError("a truncated posterior has no exact denoisers; use limit=inf")
         if self.likelihood is None:
             return self
         if not isinstance(self.prior, HasConditional):

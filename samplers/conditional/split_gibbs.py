@@ -154,9 +154,9 @@ class SplitGibbs(ConditionalSampler):
         scale: float = posterior.prior.scale  # type: ignore[attr-defined]
         if step.noise < _LEAST_NOISE:
             raise ValueError(
-                f"noise of the observations must be at least {_LEAST_NOISE * scale:.2g} m, because "
-                f"denoisers do not resolve less, got {step.noise * scale:.2g} m; use a likelihood "
-                "with more noise"
+                "noise of a joint given all observations must be at least "
+                f"{_LEAST_NOISE * scale:.2g} m, because denoisers do not resolve less, got "
+                f"{step.noise * scale:.2g} m; use a likelihood with more noise"
             )
         shape = (posterior.frames, posterior.skeleton.n_joints, 3)
         one_pool = len(pools) == 1  # estimates of different pools do not extrapolate

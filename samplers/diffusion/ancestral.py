@@ -16,7 +16,7 @@ from probmotion.samplers.diffusion.guidance import AnyGuidance, ExactGuidance, c
 from probmotion.samplers.diffusion.integrators import AnyIntegrator, SecondOrderSDE, Transition
 from probmotion.samplers.diffusion.noise_levels import NoiseLevels, check_object
 from probmotion.samplers.diffusion.states import State
-from probmotion.samplers.diffusion.views import warn_of_mirror_images
+from probmotion.samplers.diffusion.views import elevation_of_views, warn_of_mirror_images
 from probmotion.samplers.independent import Batches, IndependentSampler
 from probmotion.seeds import NormalStreams
 
@@ -112,7 +112,9 @@ class AncestralSampler(NoiseLevels, IndependentSampler):
         check_integrator(self.integrator, self.schedule.steps)
 
     def _batches(self, posterior: MotionPosterior, seed: int, progress: bool) -> Batches:
-        warn_of_mirror_images(self.name, getattr(self, "elevation", None), stacklevel=3)
+        if hasattr(self, "elevation"):
+            elevation = elevation_of_views(posterior.prior, self.elevation)
+            warn_of_mirror_images(self.name, elevation, stacklevel=3)
         state, options = self._state(self._target(posterior)), self._options()
 
         def draw(streams: NormalStreams, tick: Callable[[], Any]) -> np.ndarray:

@@ -37,8 +37,8 @@ class Ancestral3D(AncestralSampler):
     guidance : AnyGuidance
         Method of conditioning on the observations; by default moment matching with 12
         conjugate-gradient steps, as the covariance of a 3D denoiser has several large eigenvalues.
-        It is exact if the posterior is Gaussian; where several modes are left, use
-        ``ExactGuidance()`` if the prior can be conditioned.
+        It is exact for a Gaussian prior; for others, ``ExactGuidance()`` is, if the prior can be
+        conditioned.
     batch : int
         Maximum batch size; does not affect the draws.
     """

@@ -39,6 +39,8 @@ def can_guide(posterior: MotionPosterior) -> bool:
 
 def _linear(posterior: MotionPosterior) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return A, y and W of the likelihood, metres."""
+    if posterior.truncated:
+        raise NotConjugate("the posterior is truncated")
     linear = getattr(posterior.likelihood, "linear", None)
     if linear is None:
         raise NotConjugate(f"{type(posterior.likelihood).__name__} has no method linear()")
@@ -306,8 +308,8 @@ class ExactGuidance:
         if not isinstance(posterior.prior, HasConditional):
             raise UnsupportedPosterior(
                 sampler.name,
-                "with guidance exact requires a prior that can be conditioned, by "
-                f"given(likelihood), got {type(posterior.prior).__name__}; use another guidance",
+                "with ExactGuidance() requires a prior with given(likelihood), got "
+                f"{type(posterior.prior).__name__}; use MomentMatched()",
                 word="HasConditional",
             )
         return posterior.conditioned()

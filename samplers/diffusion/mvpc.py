@@ -18,7 +18,8 @@ counted once with γ = 1 and one and a half times with γ = 0, so that its varia
 Noise of single coordinates is counted two thirds of a time with γ = 1 and once with γ = 0; γ = 0 is
 therefore exact for an isotropic Gaussian. By default, γ is 1 at the noise levels at which most of
 the variance is determined, and 0 below and above, where it would add variance. With observations,
-more draws would end in a wrong mode; γ is ½ at all high noise levels.
+more draws would end in a wrong mode; γ is ½ at all high noise levels. Horizontal views all have the
+vertical coordinate, which γ > 0 would make vary too much; γ is 0 for them.
 """
 
 from __future__ import annotations
@@ -38,7 +39,13 @@ from probmotion.samplers.diffusion.guidance import AnyGuidance, MomentMatched, g
 from probmotion.samplers.diffusion.integrators import DDPM, AnyIntegrator, SecondOrderSDE
 from probmotion.samplers.diffusion.noise_levels import AnyLevels, Cosine, Karras
 from probmotion.samplers.diffusion.states import MotionState, State
-from probmotion.samplers.diffusion.views import Views, pools, symmetric_power, view_sets
+from probmotion.samplers.diffusion.views import (
+    Views,
+    elevation_of_views,
+    pools,
+    symmetric_power,
+    view_sets,
+)
 from probmotion.seeds import NormalStreams
 from probmotion.validation import check_count, check_not_negative, check_positive
 
@@ -67,7 +74,7 @@ class MultiViewPredictorCorrector(AncestralSampler):
         hold for any view, and by default alternate between five sets of three orthogonal views.
     gamma : float, optional
         Exponent γ for σ ≥ ``gamma_from``, at least 0. By default ½ with observations; without, 1
-        for σ < 4 and 0 from there on, and always 0 for views at elevation 0.
+        for σ < 4 and 0 from there on, or 0 at all levels if the views are at elevation 0.
     gamma_from : float
         Noise level σ below which γ is 0.
     corrected_from : float
@@ -133,15 +140,18 @@ class MultiViewPredictorCorrector(AncestralSampler):
             corrected_from=0.15,
         )
 
-    def gamma_at(self, level: float, observed: bool = False) -> float:
-        """Return γ at a noise level σ; ``observed``: whether there are observations."""
+    def gamma_at(self, level: float, *, observed: bool = False, horizontal: bool = False) -> float:
+        """Return γ at a noise level σ.
+
+        ``observed``: whether there are observations; ``horizontal``: whether all views are.
+        """
         if level < self.gamma_from:
             return 0.0
         if self.gamma is not None:
             return self.gamma
         if observed:
             return 0.5
-        return 1.0 if level < GAMMA_BELOW and self.elevation != 0 else 0.0
+        return 1.0 if level < GAMMA_BELOW and not horizontal else 0.0
 
     def _state(self, posterior: MotionPosterior) -> State:
         prior = posterior.prior
@@ -150,13 +160,16 @@ class MultiViewPredictorCorrector(AncestralSampler):
         denoisers = pools(prior, sets)
         guides = [guide_towards(self, posterior, self.guidance, each) for each in denoisers]
         shape = (posterior.frames, posterior.skeleton.n_joints, 3)
-        factor = self._noise_factor(sets[0], posterior.likelihood is not None)
+        horizontal = elevation_of_views(prior, self.elevation) == 0
+        factor = self._noise_factor(sets[0], posterior.likelihood is not None, horizontal)
         return MotionState(denoisers, self.schedule, shape, guides, factor)
 
     def _options(self) -> dict[str, Any]:
         return {"corrector": self._correct} if self.corrector_steps else {}
 
-    def _noise_factor(self, views: Views, observed: bool) -> Callable[[float], np.ndarray | None]:
+    def _noise_factor(
+        self, views: Views, observed: bool, horizontal: bool
+    ) -> Callable[[float], np.ndarray | None]:
         """Return the function σ → Λ^(γ(σ)/2), with ``None`` for the identity."""
         covariance = views.n_views * np.linalg.inv(views.gram)
 
@@ -164,7 +177,7 @@ class MultiViewPredictorCorrector(AncestralSampler):
         def power(gamma: float) -> np.ndarray | None:
             return symmetric_power(covariance, gamma / 2) if gamma else None
 
-        return lambda level: power(self.gamma_at(level, observed))
+        return lambda level: power(self.gamma_at(level, observed=observed, horizontal=horizontal))
 
     def _correct(self, state: State, streams: NormalStreams, x: np.ndarray, t: int) -> np.ndarray:
         """Return the state after the corrector steps at level t."""

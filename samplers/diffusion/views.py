@@ -19,6 +19,7 @@ from probmotion.posteriors.protocols import (
     DenoiserCovariance3D,
     Denoises2D,
     Denoises3D,
+    MotionPrior,
 )
 from probmotion.validation import check_count
 
@@ -119,7 +120,7 @@ def view_sets(
     ``elevation`` is that of rings for any prior.
     """
     check_count("n_views", n_views, least=2)
-    elevation = getattr(prior, "view_elevation", None) if elevation is None else elevation
+    elevation = elevation_of_views(prior, elevation)
     if elevation is not None:
         turns = np.arange(rings) / (rings * max(3, n_views))
         return [Views(views_around(n_views, elevation, start=turn)) for turn in turns]
@@ -134,6 +135,11 @@ def view_sets(
         Views(Cameras.around(np.arctan2(x, z), np.arcsin(np.clip(y, -1, 1))))
         for x, y, z in (triad.T for triad in triads)
     ]
+
+
+def elevation_of_views(prior: Denoises2D | MotionPrior, elevation: float | None) -> float | None:
+    """Return a sampler's setting, or else the elevation of the views of a learnt denoiser."""
+    return getattr(prior, "view_elevation", None) if elevation is None else elevation
 
 
 def warn_of_mirror_images(name: str, elevation: float | None, *, stacklevel: int) -> None:

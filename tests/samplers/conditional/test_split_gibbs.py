@@ -205,7 +205,7 @@ def test_nothing_observed(gaussian, keypoints):
 
 def test_noise_below_the_resolution_of_denoisers(gaussian):
     exact = MotionPosterior(gaussian, Joints3D(gaussian.mean, noise=1e-9))
-    with pytest.raises(ValueError, match=r"noise of the .* at least 7e-07 m.*, got 1e-09 m"):
+    with pytest.raises(ValueError, match=r"noise of a joint .* at least 7e-07 m.*, got 1e-09 m"):
         SplitGibbs().sample(exact, draws=1, progress=False)
 
 

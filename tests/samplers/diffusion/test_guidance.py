@@ -346,7 +346,7 @@ def test_guidance_by_covariances_needs_a_prior_that_provides_them(gaussian, keyp
             with pytest.raises(UnsupportedPosterior, match=f"that implements {protocol}") as error:
                 sampler(steps=3, guidance=guidance).sample(posterior, draws=1, progress=False)
             assert error.value.word == protocol
-        with pytest.raises(UnsupportedPosterior, match=r"given\(likelihood\), got Plain; use"):
+        with pytest.raises(UnsupportedPosterior, match=r"given\(likelihood\), got Plain; use Mom"):
             sampler(steps=3, guidance=ExactGuidance()).sample(posterior, draws=1, progress=False)
         draws = sampler(steps=3, guidance=Replacement()).sample(posterior, draws=2, progress=False)
         assert "covariance" not in draws.counts

@@ -49,6 +49,30 @@ def test_first_order_preset(gaussian):
     assert draws.counts == {"denoiser": 2 * 475}
 
 
+def test_views_of_training_at_elevation_0_have_no_gamma(gaussian):
+    """The elevation of a learnt denoiser's views counts as one that is set."""
+
+    class Learnt(type(gaussian)):
+        view_elevation = 0.0
+
+    learnt = Learnt(gaussian.mean, gaussian.covariance, gaussian.scale)
+    with pytest.warns(UserWarning, match="mvpc cannot distinguish a motion from its mirror image"):
+        draws = [
+            MultiViewPredictorCorrector(**settings)
+            .sample(MotionPosterior(prior), draws=2, progress=False)
+            .flat()
+            for prior, settings in (
+                (learnt, {}),
+                (learnt, {"gamma": 0.0}),
+                (gaussian, {"elevation": 0.0}),
+                (learnt, {"elevation": 0.1}),
+            )
+        ]
+    np.testing.assert_array_equal(draws[0], draws[1])
+    np.testing.assert_array_equal(draws[0], draws[2])
+    assert abs(draws[0] - draws[3]).max() > 0.01
+
+
 @pytest.mark.parametrize(
     ("settings", "calls"), [({}, 3 * 158), ({"elevation": 0.2, "corrector_steps": 3}, 5 * 280)]
 )
@@ -64,8 +88,7 @@ def test_gamma_by_noise_level():
     assert [sampler.gamma_at(level) for level in levels] == [0, 0, 0, 1, 1, 0, 0]
     guided = [sampler.gamma_at(level, observed=True) for level in levels]
     assert guided == [0, 0, 0, 0.5, 0.5, 0.5, 0.5]
-    level_views = MultiViewPredictorCorrector(elevation=0.0)
-    assert [level_views.gamma_at(level) for level in levels] == [0] * 7
+    assert [sampler.gamma_at(level, horizontal=True) for level in levels] == [0] * 7
     learnt = MultiViewPredictorCorrector.learnt()
     assert [learnt.gamma_at(level) for level in levels] == [0, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5]
 

@@ -1,0 +1,141 @@
+"""Compiled Metropolis walk over a pose pair that is lifted from one annotation."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from probmotion.extras import numba
+from probmotion.models.pose_pairs.pair_densities import (
+    Physics,
+    log_penetration,
+    write_limit_terms,
+)
+from probmotion.models.pose_pairs.pair_moves import SHIFT, TURN, Body, propose
+
+__all__ = ["walk_lift"]
+
+_COMPONENT_EVERY = 50
+"""Steps between draws of the component."""
+_TARGET_ACCEPTANCE = 0.3
+
+
+@numba.njit(cache=True, nogil=True)
+def walk_lift(
+    pose: np.ndarray,
+    component: int,
+    log_weights: np.ndarray,
+    means: np.ndarray,
+    cells: np.ndarray,
+    roots: np.ndarray,
+    n_steps: int,
+    moves: np.ndarray,
+    log_sizes: np.ndarray,
+    tune: bool,
+    body: Body,
+    physics: Physics,
+    rng: np.random.Generator,
+) -> int:
+    """Sample pose X and component c from w_c N(X; m_c, C_c) times the physical prior.
+
+    Returns c. Updates in place: ``pose`` (J, 3) and, with ``tune``, ``log_sizes``, one per kind of
+    move. ``log_weights`` (c,) are log w_c − ½ log det C_c; ``means`` (c, 3 J) contain all x, all y,
+    all z; ``roots`` (C, 3 J, r) are matrices R with R Rᵀ = C⁻¹, of which ``cells`` (c,) selects
+    those of the components.
+    """
+    people = len(body.roots)
+    parts, new_parts = np.zeros(2 + 2 * people), np.empty(2 + 2 * people)
+    proposed = np.empty_like(pose)
+    root = roots[cells[component]]
+    white, new_white = np.empty(root.shape[1]), np.empty(root.shape[1])
+    _whiten(pose, means[component], root, white)
+    parts[0] = -0.5 * (white @ white) + _log_lengths(pose, body)
+    parts[1] = log_penetration(pose, physics)
+    for person in range(people):
+        write_limit_terms(pose, person, physics, parts)
+    for step in range(n_steps):
+        if step % _COMPONENT_EVERY == 0:
+            component = _draw_component(pose, log_weights, means, cells, roots, white, rng)
+            root = roots[cells[component]]
+            _whiten(pose, means[component], root, white)
+            parts[0] = -0.5 * (white @ white) + _log_lengths(pose, body)
+        number = int(rng.random() * len(moves))
+        kind, joint = moves[number, 0], moves[number, 1]
+        propose(pose, moves[number], np.exp(log_sizes[kind]), body, rng, proposed)
+        new_parts[:] = parts
+        # Delayed acceptance: the Gaussian first (Christen and Fox 2005).
+        new_white[:] = white
+        _add_change(pose, proposed, root, new_white)
+        new_parts[0] = -0.5 * (new_white @ new_white) + _log_lengths(proposed, body)
+        accepted = -rng.standard_exponential() < new_parts[0] - parts[0]
+        if accepted:
+            if kind != TURN and kind != SHIFT:
+                write_limit_terms(proposed, body.person[joint], physics, new_parts)
+            accepted = new_parts[2 + people :].sum() <= physics.max_invalid
+        if accepted:
+            new_parts[1] = log_penetration(proposed, physics)
+            gain = new_parts[1 : 2 + people].sum() - parts[1 : 2 + people].sum()
+            accepted = -rng.standard_exponential() < gain
+        if accepted:
+            pose[:], parts[:], white[:] = proposed, new_parts, new_white
+        if tune:
+            log_sizes[kind] += (accepted - _TARGET_ACCEPTANCE) / np.sqrt(1.0 + step)
+    return component
+
+
+@numba.njit(cache=True, nogil=True)
+def _log_lengths(pose: np.ndarray, body: Body) -> float:
+    """Return the log density of the bone lengths, up to a constant.
+
+    It is relative to the base measure of the moves: uniform directions and log lengths.
+    """
+    total = 0.0
+    for joint in range(len(pose)):
+        parent = body.parents[joint]
+        if parent >= 0:
+            square, seed_square = 0.0, 0.0
+            for i in range(3):
+                square += (pose[joint, i] - pose[parent, i]) ** 2
+                seed_square += (body.seed[joint, i] - body.seed[parent, i]) ** 2
+            change = 0.5 * np.log(square / seed_square)
+            # A bone of length l has the volume element l³ d(log l) d(direction).
+            total += 3.0 * change - 0.5 * (change / body.bone_noise) ** 2
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def _whiten(pose: np.ndarray, mean: np.ndarray, root: np.ndarray, white: np.ndarray) -> None:
+    """Write Rᵀ (X − m), which does not depend on the mean depth, to ``white`` (r,)."""
+    white[:] = 0.0
+    _add_change(np.ascontiguousarray(mean.reshape(3, -1).T), pose, root, white)
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_change(old: np.ndarray, new: np.ndarray, root: np.ndarray, white: np.ndarray) -> None:
+    """Add Rᵀ (new − old) to ``white``."""
+    n = len(old)
+    for joint in range(n):
+        for i in range(3):
+            change = new[joint, i] - old[joint, i]
+            if change != 0.0:
+                row = root[i * n + joint]
+                for k in range(len(white)):
+                    white[k] += change * row[k]
+
+
+@numba.njit(cache=True, nogil=True)
+def _draw_component(
+    pose: np.ndarray,
+    log_weights: np.ndarray,
+    means: np.ndarray,
+    cells: np.ndarray,
+    roots: np.ndarray,
+    white: np.ndarray,
+    rng: np.random.Generator,
+) -> int:
+    """Draw the component given the pose; ``white`` (r,) is workspace."""
+    logs = log_weights.copy()
+    for c in range(len(logs)):
+        _whiten(pose, means[c], roots[cells[c]], white)
+        logs[c] -= 0.5 * (white @ white)
+    total = np.cumsum(np.exp(logs - logs.max()))
+    return min(int(np.searchsorted(total, rng.random() * total[-1], side="right")), len(logs) - 1)
