@@ -61,6 +61,7 @@ from probmotion.interaction.regression import ridge_completion
 from probmotion.metrics.coverage import coverage
 from probmotion.models.mixture.denoising import denoise_joints
 from probmotion.models.pose_pairs import PosePairPrior, penetration_depth
+from probmotion.models.pose_pairs.pair_posterior import pair_posterior
 from probmotion.models.unseen_depth import AnnotationLifts, AnnotationPrior, physical_lifts
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
@@ -167,8 +168,10 @@ def lifting_figures(pairs: Pairs) -> Figures:
 def physical_figures(pairs: Pairs) -> Figures:
     """Yield figures of 2000 draws, one of each annotation, with and without the physical prior.
 
-    Lengths of bones are relative to those of the people. ``rhat`` is the median, over 20
-    annotations, of the largest R-hat of a coordinate, with four chains of 40 draws.
+    Lengths of bones are relative to those of the people. ``log_likelihood`` (eq. 9 of Yin et al.
+    2018, mean over views) and ``root_distance`` are medians, also of the held-out pairs. ``rhat``
+    is the median, over 20 annotations, of the largest R-hat of a coordinate, with four chains of 40
+    draws.
     """
     prior, drawn = pairs.fitted(pairs.all)[0], pairs.annotated(2000, seed=1)
     physics = PosePairPrior(pairs.start, Skeleton.preset("pair17"))
@@ -192,6 +195,18 @@ def physical_figures(pairs: Pairs) -> Figures:
         centred = poses - poses.mean(axis=1, keepdims=True)
         error = np.linalg.norm(centred - truth + truth.mean(axis=1, keepdims=True), axis=-1)
         yield f"{name}_pairs_error_mm", 1000 * float(error.mean())
+    likelihood = pair_posterior(pairs.start, pairs.all.annotations).likelihood
+    assert likelihood is not None
+    roots = list(physics.skeleton.roots)
+    for name, poses in (
+        ("informed", informed),
+        ("gaussian", gaussian),
+        ("held_out", pairs.covered),
+    ):
+        logs = likelihood.log_density(poses[:300, None])
+        yield f"{name}_pairs_log_likelihood", float(np.median(logs))
+        apart = np.linalg.norm(poses[:, roots[0]] - poses[:, roots[1]], axis=-1)
+        yield f"{name}_pairs_root_distance_m", float(np.median(apart))
     chains = np.stack(
         [physical_lifts(prior, keypoints[:20], physics, draws=40, seed=chain) for chain in range(4)]
     )
