@@ -35,7 +35,7 @@ from probmotion.posteriors.sampling import progress_bar
 from probmotion.seeds import RandomNumbers, generator
 from probmotion.validation import check_count, check_finite, check_positive, check_shape
 
-__all__ = ["AnnotationPrior"]
+__all__ = ["AnnotationPrior", "check_size"]
 
 _SPREAD = 0.1  # initial standard deviation of each coordinate, metres
 _PERSPECTIVE_ROUNDS = 3  # linearisations of a perspective projection in a lift
@@ -158,7 +158,7 @@ class AnnotationPrior:
         start = start - start.mean(axis=0)
         scaled = unknown_scale or focal is not None
         if not scaled:
-            _check_size(keypoints, start)
+            check_size(keypoints, start, "use unknown_scale=True")
         views = _view_grid(azimuths, elevations)
         initial = np.eye(start.size) * _SPREAD**2
         poses = Poses(np.ones(1), start[None], initial[None])
@@ -437,12 +437,12 @@ def _square_root(covariance: np.ndarray) -> np.ndarray:
     return vectors * np.sqrt(np.maximum(values, 0.0))
 
 
-def _check_size(keypoints: np.ndarray, start: np.ndarray) -> None:
+def check_size(keypoints: np.ndarray, start: np.ndarray, remedy: str) -> None:
     """Raise ``ValueError`` if annotations and initial pose differ in scale."""
     size = np.median(np.nanstd(keypoints[..., 1], axis=1))
     ratio = float(size / max(start[:, 1].std(), 1e-9))
     if not _SIZES[0] <= ratio <= _SIZES[1]:
         raise ValueError(
-            f"annotations must be in metres at the scale of start, got a ratio of heights of "
-            f"{ratio:.3g}: use unknown_scale=True"
+            f"annotations must be in metres at the scale of the people, got a ratio of heights of "
+            f"{ratio:.3g}: {remedy}"
         )

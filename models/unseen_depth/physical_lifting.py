@@ -1,15 +1,17 @@
 """Pose pairs lifted from annotations by a learnt Gaussian prior and the physical prior.
 
 An :class:`~probmotion.models.unseen_depth.annotation_prior.AnnotationPrior` lifts annotations in
-closed form, but bone lengths of its draws differ by a fifth, and people penetrate each other. Here
-its density N(X) is multiplied by the physical prior f(X) of
-:class:`~probmotion.models.pose_pairs.pose_pairs.PosePairPrior` (Yin et al. 2018, eq. 2) and by its
-density of bone lengths. The posterior of annotation y,
+closed form, but bone lengths of its draws vary by a fifth, and people penetrate each other. Here
+its density N(X) of positions is multiplied by the physical prior f(X) of
+:class:`~probmotion.models.pose_pairs.pose_pairs.PosePairPrior` (Yin et al. 2018, eq. 2) and, for
+bones of length l, by b(X) = Π exp(−(log l − log l₀)²/2σ²), with its σ and l₀ of the seed. The
+posterior of annotation y,
 
-    p(X | y) ∝ N(X) f(X) p(y | X),
+    p(X | y) ∝ N(X) f(X) b(X) p(y | X),
 
 is sampled by Metropolis steps. They start from a draw without f, or, if it has too many invalid
-joint angles, from the nearest valid pose.
+joint angles, from the nearest valid pose. Views of less than a thousandth of the largest
+probability are left out.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +28,7 @@ from probmotion import seeds
 from probmotion.interaction.annotations.annotations import Annotations
 from probmotion.models.pose_pairs.pair_moves import APPROACH, moves_of
 from probmotion.models.pose_pairs.pose_pairs import PosePairPrior
-from probmotion.models.unseen_depth.annotation_prior import AnnotationPrior
+from probmotion.models.unseen_depth.annotation_prior import AnnotationPrior, check_size
 from probmotion.models.unseen_depth.keypoints import (
     as_keypoints,
     centred_images,
@@ -49,7 +51,8 @@ def physical_lifts(
     physics: PosePairPrior,
     *,
     draws: int = 1,
-    steps: int = 4000,
+    warmup: int = 8000,
+    steps: int = 2000,
     seed: int = 0,
     progress: bool = False,
 ) -> np.ndarray:
@@ -60,17 +63,19 @@ def physical_lifts(
     prior : AnnotationPrior
         Gaussian prior over pose pairs, learnt from annotations.
     annotations : Annotations or ndarray, (n, J, 2)
-        Keypoints as for :meth:`AnnotationPrior.lift`, metres; NaN where a joint is missing.
+        Keypoints in the order of the joints of ``physics``, metres at the scale of the people; NaN
+        where a joint is missing.
     physics : PosePairPrior
         Physical prior with the bone lengths of the people. Its density of root positions is not
         used.
     draws : int
-        Number of states of each annotation's chain, ``steps`` apart.
+        Number of states of each annotation's chain.
+    warmup : int
+        Number of Metropolis steps that tune step sizes, about 5 µs each.
     steps : int
-        Number of Metropolis steps before each draw; those before the first tune step sizes. About 6
-        µs each.
+        Number of steps before each draw.
     seed : int
-        Random seed. Draws of an annotation depend on its index and on its number of draws alone.
+        Random seed. Draws of an annotation do not depend on other annotations or on ``draws``.
     progress : bool
         Whether to show a progress bar.
 
@@ -82,16 +87,26 @@ def physical_lifts(
     Raises
     ------
     ValueError
-        If the priors' numbers of joints differ.
+        If the joints differ, keypoints are not at the scale of the people, or the prior's noise is
+        so small that covariances cannot be factorised.
     """
     if physics.skeleton.n_joints != prior.n_joints:
         raise ValueError(
             f"physics must have the prior's {prior.n_joints} joints, got "
             f"{physics.skeleton.n_joints}"
         )
+    if isinstance(annotations, Annotations):
+        names = annotations.skeleton.canonical_names
+        if names != physics.skeleton.canonical_names:
+            raise ValueError(
+                "annotations must have the joints of physics, "
+                f"{', '.join(physics.skeleton.canonical_names)}, got {', '.join(names)}"
+            )
     check_count("draws", draws)
+    check_count("warmup", warmup)
     check_count("steps", steps)
     keypoints = as_keypoints(annotations, prior.n_joints)
+    check_size(keypoints, prior.means[0], "multiply them by lift(…, unknown_scale=True).scales")
     images, centres = centred_images(keypoints)
     moves = moves_of(physics.body)
     moves = moves[moves[:, 0] != APPROACH]
@@ -103,21 +118,27 @@ def physical_lifts(
         log_sizes = np.full(APPROACH, math.log(_INITIAL_SIZE))
         if (~physics.joint_limits.is_valid(pose)).sum() > physics.max_invalid:
             pose = physics.joint_limits.nearest_valid(pose)
-        for number in range(draws):
+        for number in range(-1, draws):
             component = walk_lift(
                 pose, component, mixture.log_weights, mixture.means, mixture.cells, mixture.roots,
-                steps, moves, log_sizes, number == 0, physics.body, physics.physics, rng,
+                warmup if number < 0 else steps, moves, log_sizes, number < 0, physics.body,
+                physics.physics, rng,
             )  # fmt: skip
             pose[:, 2] -= pose[:, 2].mean()
-            out[number, mixture.row] = pose
+            if number >= 0:
+                out[number, mixture.row] = pose
 
     cores = 1 if only_one_thread() else os.cpu_count() or 1
     with progress_bar(len(images), "lifts", progress) as bar, ThreadPoolExecutor(cores) as threads:
         for mixtures in _mixtures(prior, images):
             futures = [threads.submit(walk, mixture) for mixture in mixtures]
-            for future in wait(futures, return_when=FIRST_EXCEPTION).done:
-                future.result()
-            bar.update(len(futures))
+            try:
+                for future in as_completed(futures):
+                    future.result()
+                    bar.update()
+            except BaseException:
+                threads.shutdown(cancel_futures=True)
+                raise
     out[..., :2] += centres[:, None]
     return out
 
@@ -151,8 +172,8 @@ def _mixtures(prior: AnnotationPrior, images: np.ndarray) -> Iterator[list[_Mixt
         roots, spreads, norms = (np.array(each) for each in zip(*factors, strict=True))
         members: list[list[tuple[int, int]]] = [[] for _ in rows]
         for number, part in enumerate(parts):
-            for position, row in enumerate(part.rows):
-                members[row].append((number, position))
+            for position, index in enumerate(part.rows):
+                members[index].append((number, position))
         mixtures = []
         for index, row in enumerate(rows):
             cells = np.array([number for number, _ in members[index]])
@@ -175,5 +196,10 @@ def _factors(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Return R and S, (3J, 3J − 1), with R Rᵀ = C⁻¹, S Sᵀ = C, and ½ log det C, on C's range."""
     values, vectors = np.linalg.eigh(covariance)
     values, vectors = values[1:], vectors[:, 1:]
-    assert values[0] > _LEAST_VARIANCE * values[-1]
+    if values[0] < _LEAST_VARIANCE * values[-1]:
+        raise ValueError(
+            "covariances of the prior given an annotation must have variances of at least "
+            f"{_LEAST_VARIANCE:g} of the largest one, got {values[0] / values[-1]:.2g}; use more "
+            "noise"
+        )
     return vectors / np.sqrt(values), vectors * np.sqrt(values), 0.5 * float(np.log(values).sum())
