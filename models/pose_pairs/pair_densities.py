@@ -20,9 +20,9 @@ from probmotion.models.pose_pairs.pair_moves import Body, log_root_positions
 from probmotion.models.pose_pairs.penetration_kernels import total_depths
 
 __all__ = [
-    "Physics", "Vector", "ViewAnnotations", "image_axes", "log_annotations", "log_measure",
-    "log_penetration", "log_prior", "log_prior_terms", "log_surrogate", "log_view", "log_views",
-    "project_to_view", "write_limit_terms",
+    "Physics", "Vector", "ViewAnnotations", "image_axes", "log_annotations", "log_lengths",
+    "log_measure", "log_penetration", "log_prior", "log_prior_terms", "log_surrogate", "log_view",
+    "log_views", "project_to_view", "write_limit_terms",
 ]  # fmt: skip
 
 Vector = tuple[float, float, float]
@@ -142,7 +142,14 @@ def log_surrogate(
 @numba.njit(cache=True, nogil=True)
 def log_measure(pose: np.ndarray, body: Body) -> float:
     """Return the log density of normal log lengths and root positions, 0 at the seed."""
-    lengths = 0.0
+    squares = log_lengths(pose, body)[1]
+    return log_root_positions(pose, body) - 0.5 * squares / body.bone_noise**2
+
+
+@numba.njit(cache=True, nogil=True)
+def log_lengths(pose: np.ndarray, body: Body) -> tuple[float, float]:
+    """Return Σ log(l/l₀) and Σ log²(l/l₀) over bones of length l, l₀ in the seed."""
+    total, squares = 0.0, 0.0
     for joint in range(len(pose)):
         parent = body.parents[joint]
         if parent >= 0:
@@ -150,8 +157,10 @@ def log_measure(pose: np.ndarray, body: Body) -> float:
             for i in range(3):
                 square += (pose[joint, i] - pose[parent, i]) ** 2
                 seed_square += (body.seed[joint, i] - body.seed[parent, i]) ** 2
-            lengths += (0.5 * np.log(square / seed_square)) ** 2
-    return log_root_positions(pose, body) - 0.5 * lengths / body.bone_noise**2
+            change = 0.5 * np.log(square / seed_square)
+            total += change
+            squares += change**2
+    return total, squares
 
 
 @numba.njit(cache=True, nogil=True)

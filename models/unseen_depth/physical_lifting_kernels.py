@@ -7,6 +7,7 @@ import numpy as np
 from probmotion.extras import numba
 from probmotion.models.pose_pairs.pair_densities import (
     Physics,
+    log_lengths,
     log_penetration,
     write_limit_terms,
 )
@@ -48,7 +49,7 @@ def walk_lift(
     root = roots[cells[component]]
     white, new_white = np.empty(root.shape[1]), np.empty(root.shape[1])
     _whiten(pose, means[component], root, white)
-    parts[0] = -0.5 * (white @ white) + _log_lengths(pose, body)
+    parts[0] = -0.5 * (white @ white) + _log_bones(pose, body)
     parts[1] = log_penetration(pose, physics)
     for person in range(people):
         write_limit_terms(pose, person, physics, parts)
@@ -57,7 +58,7 @@ def walk_lift(
             component = _draw_component(pose, log_weights, means, cells, roots, white, rng)
             root = roots[cells[component]]
             _whiten(pose, means[component], root, white)
-            parts[0] = -0.5 * (white @ white) + _log_lengths(pose, body)
+            parts[0] = -0.5 * (white @ white) + _log_bones(pose, body)
         number = int(rng.random() * len(moves))
         kind, joint = moves[number, 0], moves[number, 1]
         propose(pose, moves[number], np.exp(log_sizes[kind]), body, rng, proposed)
@@ -65,7 +66,7 @@ def walk_lift(
         # Delayed acceptance: the Gaussian first (Christen and Fox 2005).
         new_white[:] = white
         _add_change(pose, proposed, root, new_white)
-        new_parts[0] = -0.5 * (new_white @ new_white) + _log_lengths(proposed, body)
+        new_parts[0] = -0.5 * (new_white @ new_white) + _log_bones(proposed, body)
         accepted = -rng.standard_exponential() < new_parts[0] - parts[0]
         if accepted:
             if kind != TURN and kind != SHIFT:
@@ -83,23 +84,14 @@ def walk_lift(
 
 
 @numba.njit(cache=True, nogil=True)
-def _log_lengths(pose: np.ndarray, body: Body) -> float:
+def _log_bones(pose: np.ndarray, body: Body) -> float:
     """Return the log density of the bone lengths, up to a constant.
 
-    It is relative to the base measure of the moves: uniform directions and log lengths.
+    It is relative to the base measure of the moves, uniform directions and log lengths: a bone of
+    length l has the volume element l³ d(log l) d(direction).
     """
-    total = 0.0
-    for joint in range(len(pose)):
-        parent = body.parents[joint]
-        if parent >= 0:
-            square, seed_square = 0.0, 0.0
-            for i in range(3):
-                square += (pose[joint, i] - pose[parent, i]) ** 2
-                seed_square += (body.seed[joint, i] - body.seed[parent, i]) ** 2
-            change = 0.5 * np.log(square / seed_square)
-            # A bone of length l has the volume element l³ d(log l) d(direction).
-            total += 3.0 * change - 0.5 * (change / body.bone_noise) ** 2
-    return total
+    total, squares = log_lengths(pose, body)
+    return 3.0 * total - 0.5 * squares / body.bone_noise**2
 
 
 @numba.njit(cache=True, nogil=True)
