@@ -7,6 +7,8 @@ import pytest
 
 from probmotion import Cameras, Joints3D, Keypoints2D, MotionPosterior, UnsupportedPosterior
 from probmotion.posteriors.protocols import OrthographicOnly
+from probmotion.posteriors.truncation import TruncatedPosterior
+from probmotion.problems import load_problem
 from probmotion.samplers import (
     Ancestral3D,
     MultiViewAncestral,
@@ -15,7 +17,7 @@ from probmotion.samplers import (
 )
 from probmotion.samplers.conditional import SplitGibbs
 from probmotion.samplers.diffusion.ancestral2d import Ancestral2D
-from probmotion.samplers.diffusion.guidance import ExactGuidance
+from probmotion.samplers.diffusion.guidance import ExactGuidance, MomentMatched
 from probmotion.samplers.diffusion.sync_tweedies import SyncTweedies
 
 
@@ -91,3 +93,14 @@ def test_perspective_views_need_a_denoiser_that_supports_them(gaussian, gaussian
     posterior = MotionPosterior(Orthographic(gaussian.mean, gaussian.covariance))
     with pytest.raises(UnsupportedPosterior, match="Orthographic raised: cameras must be ortho"):
         MultiViewAncestral(perspective=True).sample(posterior, draws=1, progress=False)
+
+
+def test_truncated_posteriors_are_refused():
+    """Neither guidance nor a conditioned prior knows the truncation."""
+    whole = load_problem("gait-sparse", frames=3, components=6, noise=0.1).posterior
+    truncated = TruncatedPosterior(whole.prior, whole.likelihood, limit=10.0)
+    for guidance in (MomentMatched(), ExactGuidance()):
+        with pytest.raises(UnsupportedPosterior, match="but the posterior is truncated"):
+            Ancestral3D(guidance=guidance).sample(truncated, draws=1, progress=False)
+    with pytest.raises(ValueError, match="a truncated posterior has no exact denoisers"):
+        truncated.conditioned()
