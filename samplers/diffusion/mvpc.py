@@ -73,7 +73,7 @@ class MultiViewPredictorCorrector(AncestralSampler):
         Elevation of these views, radians; by default that of the prior's training. Exact denoisers
         hold for any view, and by default alternate between five sets of three orthogonal views.
     gamma : float, optional
-        Exponent γ for σ ≥ ``gamma_from``, at least 0. By default ½ with observations; without, 1
+        Exponent γ for σ ≥ ``gamma_from``, in [0, 1]. By default ½ with observations; without, 1
         for σ < 4 and 0 from there on, or 0 at all levels if the views are at elevation 0.
     gamma_from : float
         Noise level σ below which γ is 0.
@@ -115,6 +115,8 @@ class MultiViewPredictorCorrector(AncestralSampler):
             raise ValueError(f"corrector_size must be at most 1, got {self.corrector_size}")
         if self.gamma is not None:
             check_not_negative("gamma", self.gamma)
+            if self.gamma > 1:
+                raise ValueError(f"gamma must be at most 1, got {self.gamma}")
         check_not_negative("gamma_from", self.gamma_from)
         check_not_negative("corrected_from", self.corrected_from)
 

@@ -63,6 +63,7 @@ FREEDOM = "degrees_of_freedom must be a number above 0 or inf"
         (MultiViewAncestral, {"view_weights": (1.0, 2.0)}, r"view_weights must have shape \(5\)"),
         (MultiViewAncestral, {"view_weights": (0.0,) * 5}, f"view_weights {POSITIVE}"),
         (MultiViewPredictorCorrector, {"corrector_size": 1.5}, "corrector_size must be at most 1"),
+        (MultiViewPredictorCorrector, {"gamma": 2.0}, "gamma must be at most 1"),
         (MultiViewPredictorCorrector, {"corrector_steps": -1}, f"corrector_steps {COUNT} 0"),
         (MultiViewPredictorCorrector, {"gamma_from": math.nan}, f"gamma_from {FROM_0}"),
         (MultiViewPredictorCorrector, {"gamma": -1.0}, f"gamma {FROM_0}"),
