@@ -80,14 +80,22 @@ def propose(
     body: Body,
     rng: np.random.Generator,
     proposed: np.ndarray,
+    depth: bool = False,
 ) -> None:
-    """Write the proposal of one move; ``size`` is its scale in radians, metres or log length."""
+    """Write the proposal of one move; ``size`` is its scale in radians, metres or log length.
+
+    With ``depth``, moves are along z, and axes of rotations, except cranks and hinges, have no z.
+    """
     kind, joint, other = move
     proposed[:] = pose
     parent = body.parents[joint]
     turn, vector, centre = np.empty((3, 3)), np.empty(3), np.zeros(3)
     for i in range(3):
         vector[i] = size * rng.standard_normal()
+    if depth and kind == SHIFT:
+        vector[:2] = 0.0
+    elif depth:
+        vector[2] = 0.0
     if kind in (TURN, SWING):
         if kind == SWING:
             centre[:] = pose[parent]

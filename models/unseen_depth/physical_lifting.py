@@ -115,7 +115,7 @@ def physical_lifts(
     def walk(mixture: _Mixture) -> None:
         rng = seeds.generator(seed, "physical lift", mixture.row)
         pose, component = mixture.draw(rng)
-        log_sizes = np.full(APPROACH, math.log(_INITIAL_SIZE))
+        log_sizes = np.full((2, APPROACH), math.log(_INITIAL_SIZE))
         if (~physics.joint_limits.is_valid(pose)).sum() > physics.max_invalid:
             pose = physics.joint_limits.nearest_valid(pose)
         for number in range(-1, draws):

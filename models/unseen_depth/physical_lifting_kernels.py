@@ -38,10 +38,11 @@ def walk_lift(
 ) -> int:
     """Sample pose X and component c from w_c N(X; m_c, C_c) times the physical prior.
 
-    Returns c. Updates in place: ``pose`` (J, 3) and, with ``tune``, ``log_sizes``, one per kind of
-    move. ``log_weights`` (c,) are log w_c − ½ log det C_c; ``means`` (c, 3 J) contain all x, all y,
-    all z; ``roots`` (C, 3 J, r) are matrices R with R Rᵀ = C⁻¹, of which ``cells`` (c,) selects
-    those of the components.
+    Half of the moves are in depth, where a pose is less certain than in the image. Returns c.
+    Updates in place: ``pose`` (J, 3) and, with ``tune``, ``log_sizes`` (2, kinds) of moves in all
+    directions and in depth. ``log_weights`` (c,) are log w_c − ½ log det C_c; ``means`` (c, 3 J)
+    contain all x, all y, all z; ``roots`` (C, 3 J, r) are matrices R with R Rᵀ = C⁻¹, of which
+    ``cells`` (c,) selects those of the components.
     """
     people = len(body.roots)
     parts, new_parts = np.zeros(2 + 2 * people), np.empty(2 + 2 * people)
@@ -61,7 +62,9 @@ def walk_lift(
             parts[0] = -0.5 * (white @ white) + _log_bones(pose, body)
         number = int(rng.random() * len(moves))
         kind, joint = moves[number, 0], moves[number, 1]
-        propose(pose, moves[number], np.exp(log_sizes[kind]), body, rng, proposed)
+        depth = int(rng.random() * 2)
+        size = np.exp(log_sizes[depth, kind])
+        propose(pose, moves[number], size, body, rng, proposed, depth == 1)
         new_parts[:] = parts
         # Delayed acceptance: the Gaussian first (Christen and Fox 2005).
         new_white[:] = white
@@ -79,7 +82,7 @@ def walk_lift(
         if accepted:
             pose[:], parts[:], white[:] = proposed, new_parts, new_white
         if tune:
-            log_sizes[kind] += (accepted - _TARGET_ACCEPTANCE) / np.sqrt(1.0 + step)
+            log_sizes[depth, kind] += (accepted - _TARGET_ACCEPTANCE) / np.sqrt(1.0 + step)
     return component
 
 

@@ -12,6 +12,7 @@ from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.interaction.annotations.annotations import Annotations
 from probmotion.interaction.annotations.sources import draw_annotations
 from probmotion.models.pose_pairs import PosePairPrior, penetration_depth
+from probmotion.models.pose_pairs.pair_moves import SHIFT, TURN, propose
 from probmotion.models.unseen_depth import AnnotationPrior, physical_lifting as physical
 from probmotion.models.unseen_depth.physical_lifting import physical_lifts
 from probmotion.motion.skeleton import Skeleton
@@ -115,6 +116,27 @@ def test_draws_have_the_bones_of_the_people_and_keep_to_the_image(prior, keypoin
     apart = draws.reshape(2, 30, 34, 3)[..., :2] - few
     assert np.sqrt(np.nanmean(apart**2)) < 2 * prior.noise
     np.testing.assert_allclose(draws[..., 2].mean(axis=1), 0, atol=1e-9)
+
+
+def test_moves_in_depth(pose):
+    """People are shifted along z, and turned about axes without z: R − Rᵀ has no such part."""
+    body, rng, moved = (
+        PosePairPrior(pose, SKELETON).body,
+        np.random.default_rng(0),
+        np.empty((34, 3)),
+    )
+    for kind in (SHIFT, TURN):
+        person = body.below[body.roots[1]]
+        propose(pose, np.array([kind, body.roots[1], -1]), 0.3, body, rng, moved, True)
+        change = moved - pose
+        assert np.abs(change[person, 2]).max() > 0.01
+        np.testing.assert_array_equal(change[~person], 0)
+        if kind == SHIFT:
+            np.testing.assert_array_equal(change[:, :2], 0)
+        else:
+            before, after = (each[person] - each[person].mean(axis=0) for each in (pose, moved))
+            rotation = np.linalg.lstsq(before, after, rcond=None)[0]
+            assert rotation[0, 1] == pytest.approx(rotation[1, 0], abs=1e-9)
 
 
 def test_draws_do_not_depend_on_other_annotations_or_threads(prior, keypoints, pose):
