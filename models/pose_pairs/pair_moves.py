@@ -84,7 +84,7 @@ def propose(
 ) -> None:
     """Write the proposal of one move; ``size`` is its scale in radians, metres or log length.
 
-    With ``depth``, moves are along z, and axes of rotations, except cranks and hinges, have no z.
+    With ``depth``, shifts are along z, and turns, swings and slides about axes perpendicular to z.
     """
     kind, joint, other = move
     proposed[:] = pose

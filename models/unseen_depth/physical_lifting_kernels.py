@@ -38,11 +38,11 @@ def walk_lift(
 ) -> int:
     """Sample pose X and component c from w_c N(X; m_c, C_c) times the physical prior.
 
-    Half of the moves are in depth, where a pose is less certain than in the image. Returns c.
-    Updates in place: ``pose`` (J, 3) and, with ``tune``, ``log_sizes`` (2, kinds) of moves in all
-    directions and in depth. ``log_weights`` (c,) are log w_c − ½ log det C_c; ``means`` (c, 3 J)
-    contain all x, all y, all z; ``roots`` (C, 3 J, r) are matrices R with R Rᵀ = C⁻¹, of which
-    ``cells`` (c,) selects those of the components.
+    Half of the shifts and rotations are in depth, where a pose is less certain than in the image.
+    Returns c. Updates in place: ``pose`` (J, 3) and, with ``tune``, ``log_sizes`` (2, kinds) of
+    moves in all directions and in depth. ``log_weights`` (c,) are log w_c − ½ log det C_c;
+    ``means`` (c, 3 J) contain all x, all y, all z; ``roots`` (C, 3 J, r) are matrices R with
+    R Rᵀ = C⁻¹, of which ``cells`` (c,) selects those of the components.
     """
     people = len(body.roots)
     parts, new_parts = np.zeros(2 + 2 * people), np.empty(2 + 2 * people)

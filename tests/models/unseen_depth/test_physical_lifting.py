@@ -119,7 +119,7 @@ def test_draws_have_the_bones_of_the_people_and_keep_to_the_image(prior, keypoin
 
 
 def test_moves_in_depth(pose):
-    """People are shifted along z, and turned about axes without z: R − Rᵀ has no such part."""
+    """Shifts are along z; the matrix of a turn about an axis without z is symmetric in x and y."""
     body, rng, moved = (
         PosePairPrior(pose, SKELETON).body,
         np.random.default_rng(0),
