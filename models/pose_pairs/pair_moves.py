@@ -15,8 +15,8 @@ import numpy as np
 from probmotion.extras import numba
 
 __all__ = [
-    "APPROACH", "HINGE", "SHIFT", "STRETCH", "TURN", "Body", "log_root_positions", "moves_of",
-    "propose", "resample_placement",
+    "APPROACH", "HINGE", "SHIFT", "SLIDE", "STRETCH", "SWING", "TURN", "Body", "log_root_positions",
+    "moves_of", "propose", "resample_placement",
 ]  # fmt: skip
 
 SWING, SLIDE, STRETCH, CRANK, HINGE, TURN, SHIFT, APPROACH = range(8)

@@ -12,7 +12,7 @@ from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.interaction.annotations.annotations import Annotations
 from probmotion.interaction.annotations.sources import draw_annotations
 from probmotion.models.pose_pairs import PosePairPrior, penetration_depth
-from probmotion.models.pose_pairs.pair_moves import SHIFT, TURN, propose
+from probmotion.models.pose_pairs.pair_moves import SHIFT, SLIDE, SWING, TURN, propose
 from probmotion.models.unseen_depth import AnnotationPrior, physical_lifting as physical
 from probmotion.models.unseen_depth.physical_lifting import physical_lifts
 from probmotion.motion.skeleton import Skeleton
@@ -137,6 +137,21 @@ def test_moves_in_depth(pose):
             before, after = (each[person] - each[person].mean(axis=0) for each in (pose, moved))
             rotation = np.linalg.lstsq(before, after, rcond=None)[0]
             assert rotation[0, 1] == pytest.approx(rotation[1, 0], abs=1e-9)
+
+
+def test_steps_in_depth_are_larger(prior, keypoints, pose, monkeypatch):
+    """Images determine depth least."""
+    kept, walk_lift = [], physical.walk_lift
+
+    def watched(*arguments):
+        kept.append(arguments[8])
+        return walk_lift(*arguments)
+
+    monkeypatch.setattr(physical, "walk_lift", watched)
+    physical_lifts(prior, keypoints[:3], PosePairPrior(pose, SKELETON), steps=1)
+    everywhere, in_depth = np.exp(np.mean(kept, axis=0))
+    kinds = [SHIFT, TURN, SWING, SLIDE]
+    assert (in_depth[kinds] > 1.2 * everywhere[kinds]).all()
 
 
 def test_draws_do_not_depend_on_other_annotations_or_threads(prior, keypoints, pose):
