@@ -9,6 +9,7 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -39,11 +40,12 @@ from probmotion.motion.skeleton import Skeleton
 
 WEIGHTS = Path(__file__).parents[1] / "models" / "weights"
 FPS = 30.0
-VIEWS = 24  # videos of each part of a clip
+VIEWS = 72  # videos of each part of a clip
+SPEEDS = 0.25  # largest logarithm of the factor of a video's speed
 LENGTH, SHORTEST = 150, 30  # frames of a video
 HEIGHTS = ((0.3, 1.5), (1.5, 4.0))  # of cameras, metres; either with probability 1/2
 TRAINING = TrainingSettings(
-    steps=8000, batch=512, learning_rate=1e-3, halve_at=(3000, 5000, 6000, 7000)
+    steps=16_000, batch=512, learning_rate=1e-3, halve_at=(6000, 9000, 11_000, 13_000, 14_500)
 )
 
 CARD = """# pose-depth
@@ -52,10 +54,11 @@ Regression of the depths of a person's joints along the ray to the body, and of 
 frames at 15 per second, for `probmotion lift` with one camera ({parameters:.1f} million weights).
 
 - **Data**: made videos (`probmotion.data.videos.film`) of the clips from which `cmu-motion` was
-  fitted, {minutes:.1f} minutes, and of their mirror images: {videos} videos of up to five seconds, from
+  fitted, {minutes:.1f} minutes, and of their mirror images: {videos} videos of up to 6.4 seconds, from
   all sides, with cameras from 0.3 to 4 m high that look at the middle of the path, with bones 3 % longer
-  or shorter (standard deviation), and with a detector's noise, outliers, gaps and exchanged sides; in three of ten inputs, joints
-  are occluded for some time. Validation and test clips of the denoising study are held out, and the action soccer
+  or shorter (standard deviation), and with a detector's noise, outliers, gaps and exchanged sides. Videos have
+  speeds of 0.78 to 1.28 times those of the clips, and each arm is that of another clip in half of them. In three
+  of ten inputs, joints are occluded for some time. Validation and test clips of the denoising study are held out, and the action soccer
   as a whole.
 - **Provenance**: as `cmu-motion.md`.
 - **Not for**: bodies that are not people's, rolled cameras, and postures unlike the clips', such
@@ -82,7 +85,7 @@ def main() -> None:
     person = Skeleton.preset("person14")
     clips = recordings(arguments.data, partial(Motion.retarget, skeleton=person))
     fitted = clips["train"] + clips["actions"]
-    training = examples(fitted)
+    training = examples(fitted, vary=True)
     result = trained(training, clips["validation"], arguments.out)
     rows = []
     for part, name in (
@@ -114,10 +117,12 @@ def trained(training: DepthExamples, validation: Sequence[Motion], out: Path) ->
     return regression(load_checkpoint(model, PoseDepthTrainee.kind).tensors, {})
 
 
-def examples(clips: Sequence[Motion], views: int = VIEWS) -> DepthExamples:
-    """Return examples from videos of all clips and their mirror images."""
+def examples(clips: Sequence[Motion], views: int = VIEWS, *, vary: bool = False) -> DepthExamples:
+    """Return examples from videos of all clips and their mirror images, varied or as recorded."""
     inputs, targets = [], []
-    for number, clip in enumerate([*clips, *map(mirrored, clips)]):
+    every = [*clips, *map(mirrored, clips)]
+    others = [clip for clip in every if clip.frames >= SHORTEST]
+    for number, clip in enumerate(every):
         rng = seeds.generator(0, "pose depth", number)
         for start in range(0, max(1, clip.frames - SHORTEST + 1), LENGTH):
             part = clip.window(start, min(LENGTH, clip.frames - start))
@@ -125,8 +130,9 @@ def examples(clips: Sequence[Motion], views: int = VIEWS) -> DepthExamples:
                 continue
             for _ in range(views):
                 height = rng.uniform(*HEIGHTS[int(rng.integers(2))])
+                seen = varied(part, others, rng) if vary else part
                 video = film(
-                    reproportioned(part, rng),
+                    reproportioned(seen, rng),
                     int(rng.integers(2**31)),
                     azimuth=rng.uniform(0, 2 * np.pi),
                     height=height,
@@ -161,6 +167,44 @@ def rays_to(pixels: np.ndarray, camera: Cameras) -> np.ndarray:
     rays = level.points(level.normalised(pixels), np.ones(len(pixels)))
     unit: np.ndarray = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     return unit
+
+
+def varied(clip: Motion, others: Sequence[Motion], rng: np.random.Generator) -> Motion:
+    """Return a clip at another speed, in which each arm has probability 1/2 to be another clip's.
+
+    This adds combinations of postures that are in no clip. It is as long as the shorter clip.
+    """
+    clip = replace(clip, fps=clip.fps * np.exp(rng.uniform(-SPEEDS, SPEEDS))).resample(FPS)
+    other = others[int(rng.integers(len(others)))]
+    frames = min(clip.frames, other.frames)
+    other = other.window(int(rng.integers(other.frames - frames + 1)), frames)
+    clip = clip.window(0, frames)
+    positions = clip.positions.copy()
+    turn = chest(clip) @ chest(other).swapaxes(1, 2)
+    names = clip.skeleton.joint_names
+    for side in ("left", "right"):
+        if rng.random() < 0.5:
+            continue
+        limb = [names.index(f"{side}_{name}") for name in ("shoulder", "elbow", "wrist")]
+        for parent, joint in pairwise(limb):
+            old, new = (x.positions[:, joint] - x.positions[:, parent] for x in (clip, other))
+            length, given = (np.linalg.norm(x, axis=1, keepdims=True) for x in (old, new))
+            bone = (turn @ (new * length / given)[..., None])[..., 0]
+            positions[:, joint] = positions[:, parent] + bone
+    return replace(clip, positions=positions)
+
+
+def chest(clip: Motion) -> np.ndarray:
+    """Return the axes of the chest in every frame, to the left, up and forward: (L, 3, 3)."""
+    names = clip.skeleton.joint_names
+    left, right, neck, pelvis = (
+        clip.positions[:, names.index(name)]
+        for name in ("left_shoulder", "right_shoulder", "neck", "pelvis")
+    )
+    across = left - right
+    forward = np.cross(across, neck - pelvis)
+    axes = np.stack([across, np.cross(forward, across), forward], axis=-1)
+    return axes / np.linalg.norm(axes, axis=1, keepdims=True)
 
 
 def reproportioned(clip: Motion, rng: np.random.Generator) -> Motion:

@@ -2,7 +2,9 @@
 
 One view does not determine the depths of joints. The prior of a motion models only their linear
 covariance with the keypoints; the regression is nonlinear. Its input is relative to the apparent
-size of the body, so that it requires neither focal length nor distance.
+size of the body, so that it requires neither focal length nor distance. A bone that seems shorter
+than usual is inclined: the input contains the difference of its ends' depths for a bone of usual
+length, without sign.
 
 An image and its mirror image, in which left and right are exchanged, have the same depths. The
 estimate is therefore the mean of both.
@@ -23,7 +25,10 @@ from probmotion.files import read_arrays, written_whole
 from probmotion.motion.skeleton import Skeleton
 from probmotion.validation import check_shape
 
-__all__ = ["FRAMES", "KEYPOINTS", "RATE", "DepthEstimate", "PoseDepth", "relative_keypoints"]
+__all__ = [
+    "BONES", "FRAMES", "INPUTS", "KEYPOINTS", "RATE", "DepthEstimate", "PoseDepth",
+    "network_inputs", "relative_keypoints",
+]  # fmt: skip
 
 _PERSON = Skeleton.preset("person14")
 KEYPOINTS = tuple(j for j, name in enumerate(_PERSON.joint_names) if name not in ("neck", "pelvis"))
@@ -32,10 +37,34 @@ FRAMES = 9
 """Frames of an input; the estimate is for the one in the middle."""
 RATE = 15.0
 """Frames per second of an input."""
+BONES = {
+    f"{side}_{end}": (f"{side}_{start}", length)
+    for side in ("left", "right")
+    for start, end, length in (
+        ("shoulder", "elbow", 0.28),
+        ("elbow", "wrist", 0.21),
+        ("hip", "knee", 0.42),
+        ("knee", "ankle", 0.41),
+    )
+}
+"""Bones of arms and legs by their ends: their starts and usual lengths in metres."""
 _FAR = 2.0  # largest distance of a keypoint from the middle of the body, metres
 _FORMAT = 1
 _WEIGHTS = Path(__file__).parents[1] / "weights"
 _MIRRORED = [KEYPOINTS.index(_PERSON.mirrored_order[j]) for j in KEYPOINTS]
+_DISTANCES = (
+    *((start, end, length) for end, (start, length) in BONES.items()),
+    ("left_shoulder", "right_shoulder", 0.37),
+    ("left_hip", "right_hip", 0.2),
+    ("left_shoulder", "left_hip", 0.5),
+    ("right_shoulder", "right_hip", 0.5),
+)
+_STARTS, _ENDS = (
+    [KEYPOINTS.index(_PERSON.joint_names.index(pair[i])) for pair in _DISTANCES] for i in (0, 1)
+)
+_LENGTHS = np.array([length for _, _, length in _DISTANCES])
+INPUTS = FRAMES * (3 * len(KEYPOINTS) + 2 * len(_DISTANCES))
+"""Inputs of the network."""
 
 
 class DepthEstimate(NamedTuple):
@@ -55,7 +84,7 @@ class DepthEstimate(NamedTuple):
 def relative_keypoints(
     points: np.ndarray, visible: np.ndarray, middle: np.ndarray, size: np.ndarray
 ) -> np.ndarray:
-    """Return the input of the regression for each frame, (L, 3 J).
+    """Return the keypoints of each frame for the regression, (L, 3 J).
 
     Parameters
     ----------
@@ -76,6 +105,33 @@ def relative_keypoints(
     metres = (points - middle[:, None]) / size[:, None, None] * [1.0, -1.0]
     metres = np.clip(np.where(visible[..., None], metres, 0.0), -_FAR, _FAR)
     return np.concatenate([metres.reshape(len(points), -1), visible], axis=1)
+
+
+def network_inputs(windows: np.ndarray) -> np.ndarray:
+    """Return the inputs of the network: ``(n, FRAMES, 3 J) → (n, inputs)``.
+
+    ``windows`` are :func:`relative_keypoints`. Unknown positions are interpolated between the
+    frames in which the joint is known, those before the first and after the last are as in these,
+    and a joint that is never known is at 0. The bones of arms and legs, the hips, the shoulders and
+    the sides of the trunk have a usual length l and an apparent length d: √max(l² − d², 0)
+    estimates the difference of the depths of the ends without its sign, and √max(d² − l², 0) says
+    that the body is larger, or a keypoint wrong.
+    """
+    n, J = len(windows), len(KEYPOINTS)
+    points = windows[..., : 2 * J].reshape(n, FRAMES, J, 2)
+    known = windows[..., 2 * J :] > 0
+    frames = np.arange(FRAMES)[:, None]
+    last = np.maximum.accumulate(np.where(known, frames, -1), axis=1)
+    following = np.minimum.accumulate(np.where(known, frames, FRAMES)[:, ::-1], axis=1)[:, ::-1]
+    # A joint that is never known is 0 in every frame.
+    before = np.minimum(np.where(last < 0, following, last), FRAMES - 1)[..., None]
+    after = np.maximum(np.where(following == FRAMES, last, following), 0)[..., None]
+    share = (frames[..., None] - before) / np.maximum(after - before, 1)
+    first, second = (np.take_along_axis(points, at, axis=1) for at in (before, after))
+    filled = (1 - share) * first + share * second
+    square = ((filled[:, :, _STARTS] - filled[:, :, _ENDS]) ** 2).sum(axis=-1) - _LENGTHS**2
+    differences = [np.sqrt(np.maximum(sign * square, 0.0)) for sign in (-1, 1)]
+    return np.concatenate([part.reshape(n, -1) for part in (filled, known, *differences)], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,8 +164,8 @@ class PoseDepth:
         frames = relative_keypoints(points, visible, middle, size)
         offsets = np.round(np.arange(-(FRAMES // 2), FRAMES // 2 + 1) * fps / RATE).astype(int)
         rows = np.clip(np.arange(len(frames))[:, None] + offsets, 0, len(frames) - 1)
-        straight = self._outputs(frames[rows].reshape(len(rows), -1))
-        mirrored = self._outputs(_exchanged(frames)[rows].reshape(len(rows), -1))
+        straight = self._outputs(network_inputs(frames[rows]))
+        mirrored = self._outputs(network_inputs(_exchanged(frames)[rows]))
         order = [*_MIRRORED, J]
         mean = (straight[:, : J + 1] + mirrored[:, order]) / 2
         logs = (straight[:, J + 1 :] + mirrored[:, J + 1 :][:, order]) / 2
@@ -118,7 +174,7 @@ class PoseDepth:
         return DepthEstimate(mean[:, :J], spread[:, :J], mean[:, J], spread[:, J])
 
     def _outputs(self, inputs: np.ndarray) -> np.ndarray:
-        """Return the outputs of the last layer: ``(n, 3 J FRAMES) → (n, 2 (J + 1))``."""
+        """Return the outputs of the last layer: ``(n, inputs) → (n, 2 (J + 1))``."""
         (first, offset), *residual, (last, last_offset) = self.layers
         hidden = np.maximum(inputs @ first.T + offset, 0.0)
         for matrix, shift in residual:
@@ -160,7 +216,7 @@ class PoseDepth:
                 (floats[f"matrix{number}"], floats[f"offset{number}"])
                 for number in range(len(floats) // 2)
             ]
-            sizes = [3 * len(KEYPOINTS) * FRAMES, *(len(offset) for _, offset in layers)]
+            sizes = [INPUTS, *(len(offset) for _, offset in layers)]
             hidden, fits = sizes[1:-1], sizes[-1] == 2 * len(KEYPOINTS) + 2
             shapes = list(pairwise(sizes))
             fits &= len(set(hidden)) == 1 and len(floats) == 2 * len(layers)
@@ -178,7 +234,7 @@ class PoseDepth:
 
 
 def _exchanged(frames: np.ndarray) -> np.ndarray:
-    """Return the inputs of the mirrored image with left and right exchanged, (L, 3 J)."""
+    """Return the keypoints of the mirrored image with left and right exchanged, (L, 3 J)."""
     J = len(KEYPOINTS)
     points = frames[:, : 2 * J].reshape(-1, J, 2)[:, _MIRRORED] * [-1.0, 1.0]
     return np.concatenate([points.reshape(len(frames), -1), frames[:, 2 * J :][:, _MIRRORED]], 1)

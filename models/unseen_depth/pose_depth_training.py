@@ -9,11 +9,17 @@ import numpy as np
 
 from probmotion import seeds
 from probmotion.extras import nn, torch
-from probmotion.models.unseen_depth.pose_depth import FRAMES, KEYPOINTS, PoseDepth
+from probmotion.models.unseen_depth.pose_depth import (
+    FRAMES,
+    INPUTS,
+    KEYPOINTS,
+    PoseDepth,
+    network_inputs,
+)
 
 __all__ = ["DepthExamples", "PoseDepthTrainee", "regression"]
 
-_LAYERS, _DROPOUT = 2, 0.1
+_LAYERS, _DROPOUT = 3, 0.05
 _SPREAD = 0.01  # weight of the errors' spread in the loss: it must not cost accuracy
 _OCCLUDED = 0.3  # share of inputs of which joints are occluded for some time
 _VALIDATED = 4096  # examples per batch of the validation
@@ -57,7 +63,7 @@ class PoseDepthTrainee:
         J = len(KEYPOINTS)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seeds.integer(seed, "weights"))
-            self.network = _Network(3 * J * FRAMES, width, 2 * J + 2)
+            self.network = _Network(INPUTS, width, 2 * J + 2)
         self.settings: Mapping[str, Any] = {
             "width": width,
             "videos": [len(training.inputs), len(validation.inputs)],
@@ -88,8 +94,8 @@ class PoseDepthTrainee:
     def _loss(
         self, network: nn.Module, inputs: np.ndarray, targets: np.ndarray, device: torch.device
     ) -> torch.Tensor:
-        flat = torch.as_tensor(inputs.reshape(len(inputs), -1), device=device)
-        mean, logs = network(flat).chunk(2, dim=1)
+        flat = network_inputs(inputs).astype(np.float32)
+        mean, logs = network(torch.as_tensor(flat, device=device)).chunk(2, dim=1)
         error = (torch.as_tensor(targets, device=device) - mean).abs()
         likelihood = logs + error.detach() * torch.exp(-logs)
         return (error + _SPREAD * likelihood).mean()

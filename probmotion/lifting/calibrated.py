@@ -44,7 +44,9 @@ _MOST = 8  # views: the repair of sides compares all sets of views
 _ROUNDS = 2  # of the estimation of the size
 _TRIED = 3  # windows on which size and noise are estimated
 _FITTED = 0.9  # share of the residuals that the fit leaves
-_CONTRADICTION = 2.2  # largest ratio of a joint's residuals to the noise in three or more views
+# Largest ratio of a joint's residuals to the noise in two, and in three or more views.
+_CONTRADICTIONS = (1.6, 2.4)
+_PROPORTIONS = 3.0  # largest mean square of standardised bone lengths
 _FEWEST, _SHARE = 10, 0.1  # frames in which a view shows the person
 
 
@@ -323,7 +325,13 @@ def _worst(evidence: Sequence[Evidence]) -> tuple[Check, ...]:
     )
     residual = replace(
         worst["residual"],
-        limit=worst["residual"].limit if views == 2 else _CONTRADICTION,
+        limit=_CONTRADICTIONS[views > 2],
         problem="keypoints of a view contradict the others (calibration, synchronisation, person?)",
     )
-    return noise, residual, worst["proportions"], worst["mirrored"]
+    proportions = Check(
+        "proportions",
+        float(np.median([window.proportions for window in evidence[0].windows])),
+        _PROPORTIONS,
+        "the body has unusual proportions (another animal, swapped joints?)",
+    )
+    return noise, residual, proportions, replace(worst["mirrored"], limit=0.0)

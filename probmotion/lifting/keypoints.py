@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import median_filter
 
-from probmotion.models.unseen_depth.pose_depth import KEYPOINTS
+from probmotion.models.unseen_depth.pose_depth import BONES, KEYPOINTS
 from probmotion.motion.motion import KeypointTrack
 from probmotion.motion.retargeting import counterpart
 from probmotion.motion.skeleton import Skeleton
@@ -27,7 +27,6 @@ SIDED = (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"))
 """Joints of an arm and of a leg."""
 _SWAP_COST = 1.5  # of a second with exchanged sides, in units of a frame's typical motion
 _CAPPED = 5.0  # largest cost of a step, in the same units
-_LENGTHS = {"elbow": 0.28, "wrist": 0.21, "knee": 0.42, "ankle": 0.41}  # bone lengths, metres
 _FILTERED = 5  # frames
 _SPREAD = 0.1  # of the logarithm of a frame's size
 
@@ -161,11 +160,8 @@ def body_path(keypoints: PersonKeypoints) -> BodyPath:
     """
     points, weight, _ = keypoints
     ratios = np.zeros((len(points), 0))
-    for joint, name in enumerate(PERSON.joint_names):
-        length = _LENGTHS.get(name.rpartition("_")[2])
-        if length is None:
-            continue
-        parent = PERSON.parents[joint]
+    for end, (start, length) in BONES.items():
+        joint, parent = PERSON.joint_names.index(end), PERSON.joint_names.index(start)
         size = np.linalg.norm(points[:, joint] - points[:, parent], axis=-1) / length
         known = (weight[:, joint] > 0) & (weight[:, parent] > 0)
         # Outliers last for single frames.

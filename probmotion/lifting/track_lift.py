@@ -33,7 +33,7 @@ from probmotion.threads import one_thread
 __all__ = ["TrackLift", "lift_track"]
 
 _PITCH_ERROR = np.radians(3.5)  # standard deviation of draws' pitches about the estimate
-_DEPENDENT = 2.0  # factor of the estimated depths' sd: frames' errors are correlated
+_DEPENDENT = 1.4  # factor of the estimated depths' sd: frames' errors are correlated
 _CANDIDATES = 5  # of a window whose noise and score are estimated
 _TRIED = 3  # windows on which the noise is estimated
 _FITTED = 0.8  # share of the residuals that the fit leaves

@@ -34,7 +34,6 @@ from probmotion.lifting.window_posterior import (
     WindowPosterior,
 )
 from probmotion.lifting.window_prior import WindowPrior
-from probmotion.models.mixture.conditioning import rotation
 
 __all__ = ["PROPORTIONS", "EstimatedDepths", "Observed", "lift_window", "lift_window_views"]
 
@@ -42,7 +41,7 @@ PROPORTIONS = 0.03
 """Relative standard deviation of a bone's length between people."""
 _FREEDOM = 4.0  # degrees of freedom of the keypoints' noise
 _BONE_NOISE = 0.01  # standard deviation of a bone's length between frames, metres
-_ROUNDS = 4  # of the linearisation
+_ROUNDS = 6  # of the linearisation
 _SCREENED = 40.0  # nats below the best component at which others are left out
 _FACTORS = (0.72, 0.85, 1.0, 1.18, 1.39)  # of the first estimate of the distance
 _NEAR = 2  # headings of one component that are this close are one candidate
@@ -239,25 +238,29 @@ def _refined(
     yaw: int,
 ) -> WindowMode:
     """Return the mode of one component and heading."""
-    mean = prior.component(k).mean @ rotation(prior.yaws[yaw]).T
+    unit = WindowGaussian(prior, k, yaw, 1.0)
+    mean = unit.part.mean @ unit.rotation.T
     pose = mean - mean.mean(axis=1, keepdims=True) + path[:, None]
     at = np.repeat(path[:, None], mean.shape[1], axis=1)  # weak perspective at first
     outliers, force = np.full(seen.weight.shape, _WIDE**-2), np.zeros(at.shape)
     scales = [1.0]
     visible = seen.weight > 0
+    places = np.nonzero(visible)[-2:]
+    depths = _depth_rows(unit, seen.depths)
     # Densities of depths under different assumptions of sides have different scales.
     known = np.ones(0) if seen.depths is None else seen.depths.sd[np.isfinite(seen.depths.sd)]
     scale_of_depths = np.log(known).sum()
     best: _Solution | None = None
     for number in range(_ROUNDS):
         matrix, target = camera.linearised(at, seen.points)
+        target = target - matrix @ origin
         weight = seen.weight * outliers * (camera.focal / (seen.noise * camera.depth(at))) ** 2
-        keypoints = _Linear(matrix, target - matrix @ origin, weight)
+        keypoints = _Linear(matrix[visible], target[visible], weight[visible], places)
+        system = _system(prior, unit, keypoints, depths, pose, force)
         best = None
         for scale in prior.scales.tolist() if number == 1 else scales:
             gaussian = WindowGaussian(prior, k, yaw, scale)
-            depths = _depth_rows(gaussian, seen.depths)
-            tried = _solved(prior, gaussian, keypoints, depths, pose, force)
+            tried = system.solution(gaussian.deviation / unit.deviation)
             positions = gaussian.positions(prior, k, tried.mean[None], np.arange(len(at)))[0]
             positions = positions + origin
             square = seen.weight * _squares(camera, seen, positions)
@@ -268,10 +271,11 @@ def _refined(
                 scales, at, pose, standardised = [scale], positions, positions, square
         assert best is not None
         outliers = (_FREEDOM + 2) / (_FREEDOM + standardised)
-        force = camera.along_depth(best.leverage / camera.depth(at))
+        leverage = np.zeros(visible.shape)
+        leverage[visible] = best.leverage
+        force = camera.along_depth(leverage / camera.depth(at))
     assert best is not None
-    part = prior.component(k)
-    mean_posture = np.flatnonzero((part.frequency == 0) & ~part.ground)
+    mean_posture = np.flatnonzero((unit.part.frequency == 0) & ~unit.part.ground)
     posture = float(scales[0] * (best.mean[mean_posture] ** 2).mean())
     return WindowMode(
         best.score, k, yaw, scales[0], best.mean, best.lower, at, standardised, posture
@@ -279,20 +283,59 @@ def _refined(
 
 
 class _Linear(NamedTuple):
-    """Keypoints A X = t for positions X about the origin, and precisions of the two sides."""
+    """Keypoints A X = t of n positions X about the origin, and precisions of the two sides.
+
+    ``matrix`` is (n, 2, 3), ``target`` (n, 2), ``weight`` (n,), ``places`` their frames and joints.
+    """
 
     matrix: np.ndarray
     target: np.ndarray
     weight: np.ndarray
+    places: tuple[np.ndarray, ...]
 
 
 class _Solution(NamedTuple):
-    """Gaussian posterior of the coefficients, its log mass, and leverages of keypoints."""
+    """Gaussian posterior of the coefficients, its log mass, and the design of the keypoints."""
 
     mean: np.ndarray
     lower: np.ndarray
     score: float
-    leverage: np.ndarray
+    design: np.ndarray
+
+    @property
+    def leverage(self) -> np.ndarray:
+        """Leverages of the keypoints, (n,)."""
+        half = solve_triangular(self.lower, self.design.T, lower=True)
+        total: np.ndarray = (half**2).sum(axis=0).reshape(-1, 2).sum(axis=1)
+        return total
+
+
+class _System(NamedTuple):
+    """Linear observations of a Gaussian's standard normal coefficients, in units of their noise.
+
+    The first ``rows`` are those of keypoints. ``gram`` is Dᵀ D of the design D, ``pull`` is Dᵀ y
+    for the residual y, plus the force.
+    """
+
+    design: np.ndarray
+    residual: np.ndarray
+    gram: np.ndarray
+    pull: np.ndarray
+    rows: int
+
+    def solution(self, factor: np.ndarray) -> _Solution:
+        """Return the posterior with the component's deviations multiplied by a factor, (r,)."""
+        n = self.rows
+        factors = np.ones(len(self.pull))
+        factors[: len(factor)] = factor
+        precision = factors[:, None] * self.gram * factors
+        precision[np.diag_indices(len(factors))] += 1.0
+        lower = np.linalg.cholesky(precision)
+        z = solve_triangular(lower, factors * self.pull, lower=True)
+        z = solve_triangular(lower, z, lower=True, trans=1)
+        off = self.residual[n:] - self.design[n:] @ (factors * z)
+        score = -0.5 * (z @ z + off @ off) - np.log(np.diag(lower)).sum()
+        return _Solution(z, lower, score, self.design[:n] * factors)
 
 
 def _depth_rows(
@@ -302,14 +345,16 @@ def _depth_rows(
     part, sd = gaussian.part, gaussian.deviation
     if depths is None:
         return np.zeros((0, len(sd))), np.zeros(0)
-    rays = (depths.rays @ gaussian.rotation)[:, None]
+    frames, limbs = np.nonzero(np.isfinite(depths.sd))
+    rays, spread = (depths.rays @ gaussian.rotation)[frames], depths.sd[frames, limbs]
+    joints = np.array(LIMBS)[limbs]
     basis, mean = (
-        (values[:, LIMBS] - values[:, HIPS].mean(axis=1, keepdims=True))
+        values[frames, joints] - values[:, HIPS].mean(axis=1)[frames]
         for values in (part.basis, part.mean)
     )
-    design = (rays[:, :, None] @ basis)[:, :, 0] * sd / depths.sd[..., None]
-    residual = (depths.values - (mean * rays).sum(axis=-1)) / depths.sd
-    return design.reshape(-1, len(sd)), residual.ravel()
+    design = (rays[:, None] @ basis)[:, 0] * sd / spread[:, None]
+    residual = (depths.values[frames, limbs] - (mean * rays).sum(axis=-1)) / spread
+    return design, residual
 
 
 def _squares(
@@ -322,47 +367,40 @@ def _squares(
     return square
 
 
-def _solved(
+def _system(
     prior: WindowPrior,
     gaussian: WindowGaussian,
     keypoints: _Linear,
     depths: tuple[np.ndarray, np.ndarray],
     pose: np.ndarray,
     force: np.ndarray,
-) -> _Solution:
-    """Return the Gaussian posterior given linear observations, bones about a pose and a force."""
+) -> _System:
+    """Return the system of linear observations, bones about a pose and a force."""
     part, R, sd = gaussian.part, gaussian.rotation, gaussian.deviation
-    matrix, target, weight = keypoints
-    L, J = weight.shape[-2:]
+    matrix, target, weight, places = keypoints
+    L, J = pose.shape[:2]
     r, bones = len(sd), J - 1
-    q, n = r + 1 + bones, 2 * weight.size
+    q, n = r + 1 + bones, 2 * len(weight)
     m = n + L * bones
     root = np.sqrt(weight)[..., None]
     turned = (matrix * root[..., None]) @ R
     design, residual = np.zeros((m + len(depths[1]), q)), np.empty(m + len(depths[1]))
-    design[:n, :r] = ((turned @ part.basis) * sd).reshape(n, r)
+    design[:n, :r] = ((turned @ part.basis[places]) * sd).reshape(n, r)
     design[:n, r] = (matrix[..., 1] * root).ravel() * FLOOR_SPREAD
-    residual[:n] = (target * root - (turned @ part.mean[..., None])[..., 0]).ravel()
+    residual[:n] = (target * root - (turned @ part.mean[places][..., None])[..., 0]).ravel()
     # Bones, linearised along their current directions.
     along = pose[:, prior.children] - pose[:, prior.parents]
     along = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), _BONE_NOISE) @ R
-    spread = part.basis[:, prior.children] - part.basis[:, prior.parents]
-    rows = (along[..., None, :] @ spread)[..., 0, :] * sd
-    design[n:m, :r] = rows.reshape(L * bones, r) / _BONE_NOISE
+    spread = (part.directions[prior.children] - part.directions[prior.parents]) * sd
+    cosines = prior.cosines(np.arange(L))[:, part.frequency] / _BONE_NOISE
+    rows = (along.swapaxes(0, 1) @ spread).swapaxes(0, 1) * cosines[:, None]
+    design[n:m, :r] = rows.reshape(L * bones, r)
     own = np.arange(L * bones)
     design[n + own, r + 1 + own % bones] = -np.tile(part.bones, L) * PROPORTIONS / _BONE_NOISE
     average = part.mean[:, prior.children] - part.mean[:, prior.parents]
     residual[n:m] = (part.bones - (along * average).sum(axis=-1)).ravel() / _BONE_NOISE
     design[m:, :r], residual[m:] = depths
-    precision = design.T @ design
-    precision[np.arange(q), np.arange(q)] += 1.0
     pull = design.T @ residual
     pull[:r] += np.tensordot(force @ R, part.basis, axes=3) * sd
     pull[r] += force[..., 1].sum() * FLOOR_SPREAD
-    lower = np.linalg.cholesky(precision)
-    z = solve_triangular(lower, solve_triangular(lower, pull, lower=True), lower=True, trans=1)
-    half = solve_triangular(lower, design[:n].T, lower=True)
-    leverage = np.einsum("qn,qn->n", half, half).reshape(*weight.shape, 2).sum(axis=-1)
-    off = residual[n:] - design[n:] @ z
-    score = -0.5 * (z @ z + off @ off) - np.log(np.diag(lower)).sum()
-    return _Solution(z, lower, score, leverage)
+    return _System(design, residual, design.T @ design, pull, n)

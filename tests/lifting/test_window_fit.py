@@ -7,7 +7,14 @@ from probmotion.data.synthetic.gaits import make_gait
 from probmotion.geometry.rotations import vector_to_matrix
 from probmotion.lifting.camera import LevelCamera
 from probmotion.lifting.keypoints import HIPS, LIMBS, PERSON
-from probmotion.lifting.window_fit import EstimatedDepths, Observed, _depth_rows, lift_window
+from probmotion.lifting.window_fit import (
+    EstimatedDepths,
+    Observed,
+    _depth_rows,
+    _Linear,
+    _system,
+    lift_window,
+)
 from probmotion.lifting.window_posterior import WindowGaussian
 
 CAMERA = LevelCamera(900.0, (500.0, 500.0), -0.1)
@@ -111,6 +118,28 @@ def test_rows_of_depths_are_those_of_the_motion(window_prior):
     step = np.zeros(len(mode.mean))
     step[3] = 1.0
     assert np.allclose(off(mode.mean) - off(mode.mean + step), rows[:, 3])
+
+
+def test_the_posterior_at_a_scale_is_that_of_a_system_with_its_deviations(window_prior):
+    truth, seen = observed(window_prior)
+    seen.weight[3:7, 2:9] = 0.0
+    visible = seen.weight > 0
+    matrix, target = CAMERA.linearised(truth, seen.points)
+    weight = np.full(visible.sum(), 1e4)
+    keypoints = _Linear(matrix[visible], target[visible], weight, np.nonzero(visible))
+    force = np.random.default_rng(0).standard_normal(truth.shape)
+    first, other = (WindowGaussian(window_prior, 2, 5, scale) for scale in (1.0, 2.0))
+    solutions = []
+    for gaussian in (first, other):
+        rows = _depth_rows(gaussian, EstimatedDepths(depths(truth), np.full((20, 12), 0.1), RAYS))
+        system = _system(window_prior, gaussian, keypoints, rows, truth, force)
+        solutions.append(system.solution(other.deviation / gaussian.deviation))
+    for scaled, built in zip(*solutions, strict=True):
+        assert np.allclose(scaled, built)
+    leverage = solutions[0].leverage
+    design = solutions[0].design
+    covariance = np.linalg.inv(solutions[0].lower @ solutions[0].lower.T)
+    assert leverage == pytest.approx(np.diag(design @ covariance @ design.T).reshape(-1, 2).sum(1))
 
 
 def test_draws_have_the_moments_of_the_modes(window_prior):

@@ -11,9 +11,11 @@ from probmotion.models.training.settings import TrainingSettings
 from probmotion.models.training.trainer import train
 from probmotion.models.unseen_depth.pose_depth import (
     FRAMES,
+    INPUTS,
     KEYPOINTS,
     RATE,
     PoseDepth,
+    network_inputs,
     relative_keypoints,
 )
 from probmotion.models.unseen_depth.pose_depth_training import (
@@ -37,7 +39,7 @@ def rng():
 
 @pytest.fixture
 def network(rng):
-    sizes = [3 * J * FRAMES, 16, 16, 2 * J + 2]
+    sizes = [INPUTS, 16, 16, 2 * J + 2]
     return PoseDepth(
         [
             (0.1 * rng.normal(size=(o, i)), 0.1 * rng.normal(size=o))
@@ -84,12 +86,47 @@ def test_inputs_span_the_same_time_at_other_rates(network, rng):
     assert np.allclose(twice.depth[::2], first.depth)
 
 
+def test_inputs_contain_the_depths_along_shortened_bones(rng):
+    windows = np.ones((1, FRAMES, 3 * J))
+    points = windows[..., : 2 * J].reshape(FRAMES, J, 2)
+    points[:] = rng.normal(size=points.shape)
+    hip, knee, ankle = (
+        KEYPOINTS.index(PERSON.joint_names.index(f"left_{name}"))
+        for name in ("hip", "knee", "ankle")
+    )
+    # Thighs are 42 cm, shanks 41 cm long.
+    points[:, knee] = points[:, hip] + [0.3, 0.0]
+    points[:, ankle] = points[:, knee] + [0.0, -0.5]
+    inputs = network_inputs(windows)[0, 3 * J * FRAMES :].reshape(2, FRAMES, -1)
+    shorter, longer = inputs[:, 4]
+    assert np.isclose(shorter, np.sqrt(0.42**2 - 0.3**2)).sum() == 1
+    assert np.isclose(longer, np.sqrt(0.5**2 - 0.41**2)).sum() == 1
+    assert (shorter * longer == 0).all()
+
+
+def test_unknown_keypoints_are_interpolated_in_time(rng):
+    points, known = rng.normal(size=(FRAMES, J, 2)), np.ones((FRAMES, J))
+    known[[0, 3, 4, 8], 2] = 0.0
+    known[:, 5] = 0.0
+    hidden = np.where(known[..., None] > 0, points, 0.0).reshape(FRAMES, -1)
+    inputs = network_inputs(np.concatenate([hidden, known], axis=1)[None])[0]
+    filled = inputs[: 2 * J * FRAMES].reshape(FRAMES, J, 2)
+    seen = np.array([1, 2, 5, 6, 7])
+    for axis in range(2):
+        expected = np.interp(np.arange(FRAMES), seen, points[seen, 2, axis])
+        assert np.allclose(filled[:, 2, axis], expected)
+    assert (filled[:, 5] == 0).all()
+    others = [j for j in range(J) if j not in (2, 5)]
+    assert np.allclose(filled[:, others], points[:, others])
+    assert np.array_equal(inputs[2 * J * FRAMES : 3 * J * FRAMES], known.ravel())
+
+
 def test_trained_weights_give_the_same_network(rng):
     inputs = rng.normal(size=(30, 3 * J))
     examples = DepthExamples([inputs], [np.zeros((30, J + 1))])
     trainee = PoseDepthTrainee(examples, examples, width=16)
     network = regression(trainee.network.state_dict(), {})
-    rows = rng.normal(size=(5, 3 * J * FRAMES))
+    rows = rng.normal(size=(5, INPUTS))
     with torch.no_grad():
         expected = trainee.network.eval()(torch.as_tensor(rows, dtype=torch.float32)).numpy()
     assert np.allclose(network._outputs(rows), expected, atol=1e-5)
