@@ -22,7 +22,7 @@ from probmotion.models.mixture.spectrum import principal_directions
 from probmotion.models.pose_pairs.joint_limits import JointLimits
 from probmotion.models.training.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from probmotion.models.unseen_depth.annotation_prior import AnnotationPrior
-from probmotion.models.unseen_depth.pose_depth import PoseDepth
+from probmotion.models.unseen_depth.pose_depth import INPUTS, PoseDepth
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors import streams
 from probmotion.posteriors.reference import StoredReference
@@ -125,7 +125,7 @@ def read_spectra(folder):
 
 
 def write_depths(folder):
-    layers = [(0.1 * np.ones((o, i)), np.zeros(o)) for i, o in ((324, 4), (4, 4), (4, 26))]
+    layers = [(0.1 * np.ones((o, i)), np.zeros(o)) for i, o in ((INPUTS, 4), (4, 4), (4, 26))]
     PoseDepth(layers, {"command": "x"}).save(folder / "d.npz")
 
 
