@@ -5,8 +5,8 @@ denoisers), mean over seeds.
 
 ``learnt``: see :func:`learnt_figures` and ``vae_figures.py``.
 
-``images``, ``lift``, ``mixing``: see ``image_figures.py``, ``lift_figures.py``,
-``mixing_figures.py``.
+``cameras``, ``images``, ``lift``, ``mixing``: see ``camera_figures.py``, ``image_figures.py``,
+``lift_figures.py``, ``mixing_figures.py``.
 
 ``exact-priors``: coverages are mean distances from held-out pose pairs to the nearest lifted
 annotation in interaction coordinates, metres (:func:`probmotion.metrics.coverage.coverage`);
@@ -30,6 +30,7 @@ from pathlib import Path
 
 import numpy as np
 from arviz_stats.base import array_stats
+from camera_figures import camera_figures
 from image_figures import image_figures
 from lift_figures import lift_figures
 from mixing_figures import mixing_figures
@@ -525,6 +526,8 @@ def main() -> None:
     )
     command.add_argument("--held-out", nargs="*", default=SALSA_HELD_OUT, help="Salsa clips.")
     commands.add_parser("diffusion", help="Diffusion samplers against exact posteriors.")
+    command = commands.add_parser("cameras", help="Lifts of one and of several calibrated cameras.")
+    command.add_argument("--data", required=True, help="Folder with the real motions.")
     command = commands.add_parser("images", help="Reconstructions of made images.")
     command.add_argument("--category", choices=["quadruped", "person"], default="quadruped")
     command.add_argument("--data", type=Path, help="Folder with real motions; else synthetic ones.")
@@ -552,6 +555,8 @@ def main() -> None:
         figures = image_figures(options.category, options.data, *rest)
     elif options.command == "lift":
         figures = lift_figures(Path(options.data), options.lifter)
+    elif options.command == "cameras":
+        figures = camera_figures(Path(options.data))
     elif options.command == "learnt":
         folder = Path(options.data)
         figures = itertools.chain(learnt_figures(folder), vae_figures(folder))

@@ -14,9 +14,8 @@ from probmotion.data.denoising_clips import denoising_clips
 from probmotion.data.synthetic.gaits import make_gait
 from probmotion.data.videos import Video, film, quadruped_as_person
 from probmotion.io.files import load
-from probmotion.io.recordings import read_recording
 from probmotion.lifting import Lift, lift
-from probmotion.motion.motion import KeypointTrack, Motion
+from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
 
 PERSON = Skeleton.preset("person14")
@@ -84,28 +83,6 @@ def lift_figures(folder: Path, lifter_folder: Path | None = None) -> Iterator[tu
     for kind, values in marks.items():
         yield f"lift_flagged_{kind}", float(np.mean(values))
     yield "lift_flagged_bad", float(np.mean(list(marks.values())))
-    yield from balancing_figures(folder)
-
-
-def balancing_figures(folder: Path) -> Iterator[tuple[str, float]]:
-    """Yield errors of lifts of single calibrated views of a balancing person, and who is marked.
-
-    The truth is the robust triangulation of all four views.
-    """
-    path = folder / "pose2sim_multiview" / "S00_P00_T01_BalancingTrial_multiview.npz"
-    truth = about_hips(read_recording(path, fps=None).filtered)
-    with np.load(path) as archive:
-        views = list(zip(archive["keypoints"], archive["confidence"], strict=True))
-    marked = []
-    for number, (points, confidence) in enumerate(views, start=1):
-        skeleton = Skeleton.preset("body25b")
-        track = KeypointTrack(points, confidence, skeleton, 60.0, f"cam_0{number}")
-        calibration = folder / "originals" / "Calib_qualisys.toml"
-        result = lift(track, camera=calibration, progress=False)
-        distance = np.linalg.norm(about_hips(result.mean.positions) - truth, axis=-1)
-        yield f"lift_balancing_view_{number}_mpjpe_mm", 1000 * float(np.nanmean(distance))
-        marked.append(not result.trusted)
-    yield "lift_flagged_balancing", float(np.mean(marked))
 
 
 def held_out(folder: Path) -> list[Motion]:

@@ -184,6 +184,18 @@ def test_keypoints_that_no_person_explains_are_flagged(video, kind, failed):
     assert result.summary()[0].startswith("Do not trust")
 
 
+def test_people_who_move_up_and_down_are_not_taken_for_a_moving_camera(video, lifted):
+    points = video.track.keypoints.copy()
+    points[..., 1] += (
+        60 * np.sin(2 * np.pi * 0.6 * np.arange(len(points)) / video.track.fps)[:, None]
+    )
+    track = replace(video.track, keypoints=points)
+    result = lift(track, image_size=video.size, progress=False, draws=2)
+    moving, still = ({c.name: c for c in one.checks}["unsteady"] for one in (result, lifted))
+    assert moving.passed
+    assert moving.value == pytest.approx(still.value, rel=0.3)
+
+
 @pytest.mark.parametrize(
     ("change", "options", "words"),
     [

@@ -69,7 +69,8 @@ def best_filter(errors, joints):
 
 def test_optimisation_beats_filters_on_occluded_joints_and_is_on_par_on_all(errors):
     assert errors["optimization"][OCCLUDED] < 0.9 * best_filter(errors, OCCLUDED)
-    assert errors["optimization"][ALL] < best_filter(errors, ALL)
+    # 29.5 mm against 30.8 mm.
+    assert 0.9 < errors["optimization"][ALL] / best_filter(errors, ALL) < 1
 
 
 def test_corrected_means_are_better_than_those_of_the_spectral_prior(errors):
@@ -85,11 +86,6 @@ def test_corrected_means_without_optimisation_beat_filters(errors):
     assert errors["amortised"][OCCLUDED] < 0.9 * best_filter(errors, OCCLUDED)
 
 
-@pytest.mark.xfail(strict=True, reason="29.5 mm against 30.8 mm; trained on nine minutes of motion")
-def test_optimisation_beats_filters_on_all_joints(errors):
-    assert errors["optimization"][ALL] < 0.9 * best_filter(errors, ALL)
-
-
-@pytest.mark.xfail(strict=True, reason="networks generalise poorly to unseen actions")
-def test_regression_beats_filters_on_occluded_joints(errors):
-    assert errors["regression"][OCCLUDED] < 0.9 * best_filter(errors, OCCLUDED)
+def test_regression_alone_is_behind_filters(errors):
+    assert errors["regression"][ALL] > best_filter(errors, ALL)
+    assert errors["regression"][OCCLUDED] > best_filter(errors, OCCLUDED)
