@@ -66,8 +66,8 @@ _ANKLES, _HIPS = (
 _STEP, _LAG = 1 / 15, 2  # keypoints are averaged over _STEP seconds and compared _LAG steps apart
 _FEWEST, _SHARE = 10, 0.1  # visible frames of the joints whose residuals are checked
 # Chosen on lifts of clips that a prior and a network had not seen: of 213 with errors below 100 mm,
-# at most two are above a limit, and four above ``mirrored``, since that of mirrored videos may be
-# small too.
+# at most two are above a limit, and four above ``mirrored``, which has to be low enough for
+# mirrored videos.
 _LIMITS = {
     "noise": (0.04, "the keypoints' noise is more than 4 cm at the person's distance"),
     "residual": (2.6, "keypoints of a joint do not follow a body before a still camera"),
