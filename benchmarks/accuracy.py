@@ -397,9 +397,10 @@ def denoising_figures(folder: Path) -> Figures:
 def learnt_figures(folder: Path) -> Figures:
     """Yield errors of means corrected by networks over those of the spectral prior alone.
 
-    Same windows as above, one draw of the noise. Regression: without the optimisation of the
-    Motion-DVAE for the recording; also over a Kalman smoother. Acceleration ratios are to the
-    truth, of draws (median over draws) and of means.
+    Same windows as above, one draw of the noise. ``dvae_regression``: the network
+    `joint-corrector` alone; ``dvae``: followed by 50 iterations of the Motion-DVAE. Both are also
+    compared with a Kalman smoother. Acceleration ratios are to the truth, of draws (median over
+    draws) and of means.
     """
     kinds, methods = ("noise", "all", "occluded"), ("dvae", "dvae_regression")
     errors: dict[str, list[list[float]]] = {kind: [] for kind in kinds}

@@ -60,8 +60,10 @@ Command (seconds of the fit on one thread: {seconds:.0f}):
 
     python notebooks/ship_cmu_motion.py --data ../shared/data{option}
 
-Two-second windows; the log density (nats, positions in metres) includes heading and ground
-position.{limbs}
+Log density: in nats, positions in metres, of windows of two seconds with heading and ground position.
+Error and intervals: of arms and legs, of which noisy positions (4 cm) are observed, an arm and
+then a leg hidden for a third of the frames each, in five of every ten seconds; intervals contain this share of
+coordinates. ±: standard error over clips.{limbs}
 """
 
 HEAD = """- **Head**: the recordings have no nose, eyes and ears. These five points are *assumed*, not
@@ -73,13 +75,11 @@ HEAD = """- **Head**: the recordings have no nose, eyes and ears. These five poi
   face is therefore no measurement of how people move their heads.
 """
 
-LIMB_NOTE = """ *Limbs* is the log density of the twelve joints of arms and legs alone, per
-coordinate, under this prior and under `cmu-motion`. The face of held-out clips is placed as in
-training, with other random turns.
+LIMB_NOTE = """
 
-Denoising of five seconds of the validation clips of which only these twelve joints are observed,
-with noise of 4 cm, an arm and then a leg hidden for a third of the frames each: {errors[0]:.1f} mm mean
-error, with `cmu-motion` {errors[1]:.1f} mm. In draws, distances between points of the face vary by 2 to
+*Limbs* is the log density of the twelve joints of arms and legs alone, per coordinate, and after the
+slash that under `cmu-motion`, as for errors. The face of held-out clips is placed as in
+training, with other random turns. In draws, distances between points of the face vary by 2 to
 4 cm (bones: by 5 to 9 cm): the prior does not know that they are constant."""
 
 
@@ -117,15 +117,26 @@ def main() -> None:
     replace(prior, card=card).save(WEIGHTS / f"{name}.npz")
     parts = {"training": training, "validation": held_out["validation"], "test": held_out["test"]}
     parts[f"{HELD_OUT_ACTION} (action kept out)"] = held_out["soccer"]
-    columns = ["clips", "windows", "log density per coordinate"]
-    rows = [[part, f"{n}", f"{value:.2f}"] for part, n, value in densities(prior, parts)]
+    models = [prior]
+    columns = ["clips", "windows", "log density per coordinate", "error, mm", "90 % intervals"]
     if skeleton == "coco17":
-        reference = SpectralMixtureMotion.load(NAMES["person14"])
-        columns += ["limbs", f"limbs, `{NAMES['person14']}`"]
-        rows[0] += ["–", "–"]  # too many windows
-        for row, clips in zip(rows[1:], list(parts.values())[1:], strict=True):
-            row += [f"{limb_density(model, clips):.2f}" for model in (prior, reference)]
-        errors = [limb_error(model, held_out["validation"]) for model in (prior, reference)]
+        models.append(SpectralMixtureMotion.load(NAMES["person14"]))
+        columns.insert(3, "limbs")
+    rows = []
+    for part, clips in parts.items():
+        windows, density, error = log_density(prior, clips)
+        row = [part, f"{windows}", f"{density:.2f} ± {error:.2f}"]
+        if part == "training":  # too many windows for the other columns
+            rows.append(row + ["–"] * (len(columns) - len(row)))
+            continue
+        if skeleton == "coco17":
+            row.append(" / ".join(f"{limb_density(model, clips):.2f}" for model in models))
+        errors, (inside, spread) = [], (np.nan, np.nan)
+        for model in reversed(models):
+            distance, (inside, spread) = limb_accuracy(model, clips)
+            errors.insert(0, f"{1000 * distance:.1f}")
+        row += [" / ".join(errors), f"{100 * inside:.0f} ± {100 * spread:.0f} %"]
+        rows.append(row)
     table = [columns, ["---"] * len(columns), *rows]
     text = CARD.format(
         name=name,
@@ -137,7 +148,7 @@ def main() -> None:
         rows="\n".join(f"| {' | '.join(row)} |" for row in table),
         seconds=seconds,
         option="" if skeleton == "person14" else f" --skeleton {skeleton}",
-        limbs=LIMB_NOTE.format(errors=errors) if skeleton == "coco17" else "",
+        limbs=LIMB_NOTE if skeleton == "coco17" else "",
     )
     (WEIGHTS / f"{name}.md").write_text(text, encoding="utf-8")
     print(text)
@@ -173,16 +184,24 @@ def joined(priors: Sequence[SpectralMixtureMotion]) -> SpectralMixtureMotion:
     return replace(priors[0], weights=weights, **stacked)
 
 
-def densities(
-    prior: SpectralMixtureMotion, parts: dict[str, Sequence[Motion]]
-) -> list[tuple[str, int, float]]:
-    """Return name, number of windows and mean log density per coordinate of each part."""
-    out = []
-    for name, motions in parts.items():
-        windows = windows_of(motions, prior.frames)
-        density = float(np.mean(prior.log_prior(windows))) / windows[0].size
-        out.append((name, len(windows), density))
-    return out
+def log_density(
+    prior: SpectralMixtureMotion, motions: Sequence[Motion]
+) -> tuple[int, float, float]:
+    """Return the number of windows, and mean and standard error of log densities per coordinate."""
+    values = []
+    for motion in motions:
+        if motion.frames >= prior.frames:
+            windows = windows_of([motion], prior.frames)
+            values.append(prior.log_prior(windows) / windows[0].size)
+    return sum(map(len, values)), *mean_and_error(values)
+
+
+def mean_and_error(values: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Return the mean of all values, and its standard error if those of a clip are dependent."""
+    mean, n = np.concatenate(values).mean(), len(values)
+    sums = [(each - mean).sum() for each in values]
+    error = np.sqrt(np.square(sums).sum() * n / (n - 1)) / sum(map(len, values))
+    return float(mean), float(error)
 
 
 def limb_density(prior: SpectralMixtureMotion, motions: Sequence[Motion]) -> float:
@@ -208,11 +227,17 @@ def limb_density(prior: SpectralMixtureMotion, motions: Sequence[Motion]) -> flo
     return float(np.mean(values)) / (L * 3 * J)
 
 
-def limb_error(prior: SpectralMixtureMotion, motions: Sequence[Motion]) -> float:
-    """Return the mean error of limbs denoised from noisy limbs with gaps, millimetres."""
+def limb_accuracy(
+    prior: SpectralMixtureMotion, motions: Sequence[Motion]
+) -> tuple[float, tuple[float, float]]:
+    """Return error (metres) and coverage of limbs denoised from noisy limbs with gaps.
+
+    Coverage is the share of coordinates in 90 % intervals, with its standard error over clips.
+    """
     joints = [prior.skeleton.index(name) for name in LIMBS]
-    errors = []
+    errors, inside = [], []
     for motion in motions:
+        shares = []
         limbs = motion.positions[:, [motion.skeleton.index(name) for name in LIMBS]]
         for start in range(0, max(motion.frames - 149, 1), 300):
             truth = limbs[start : start + 150]
@@ -232,8 +257,11 @@ def limb_error(prior: SpectralMixtureMotion, motions: Sequence[Motion]) -> float
                 progress=False,
                 prior=prior,
             )
-            errors.append(np.linalg.norm(result.mean[:, joints] - truth, axis=-1).mean())
-    return 1000 * float(np.mean(errors))
+            error = result.mean[:, joints] - truth
+            errors.append(np.linalg.norm(error, axis=-1).mean())
+            shares.append((np.abs(error) < 1.645 * result.sd[:, joints]).mean())
+        inside.append(np.array(shares))
+    return float(np.mean(errors)), mean_and_error(inside)
 
 
 def windows_of(motions: Sequence[Motion], frames: int) -> np.ndarray:

@@ -3,9 +3,10 @@
     python notebooks/ablations/motion_dvae.py --out dvae
     python notebooks/ablations/motion_dvae.py --quick --out quick   (synthetic clips, tiny networks)
 
-``--parts`` selects table, speed, recording and posterior. Recordings are simulated from held-out
+``--parts`` selects table, trainings, speed, recording and posterior. Recordings are simulated from held-out
 clips with noise, outliers and occluded limbs. The package includes the prior and its denoiser; the
-networks of the ablations "no prior" and "no noisy training" are trained here for as many steps.
+networks of the ablations "no prior" and "no noisy training" are trained here for as many steps, for
+``trainings`` with three seeds each, beside the full network.
 Draws are stored in ``--out/comparisons``. Clips are read from ``--data``, by default
 ../shared/data of the repository.
 """
@@ -65,6 +66,13 @@ KINDS: Mapping[str, tuple[float, float | None, str]] = {
 """Noise scale in metres, degrees of freedom, and frames in which limbs are occluded."""
 
 
+VARIANTS: Mapping[str, Mapping[str, Any]] = {
+    "no prior": {"latent_weight": 0.0},
+    "no noisy training": {"noise": JointNoise.nearly_clean()},
+}
+"""Settings of the denoisers of the ablations that require training."""
+
+
 @dataclass(frozen=True)
 class Recording:
     """Held-out motion, its noisy joints and a mask of occluded joints."""
@@ -111,7 +119,9 @@ class Study:
         prior = MotionDVAE.load(self.out / "networks" / "dvae")
         return prior.of(inference_network=self.trained("full", prior))
 
-    def trained(self, name: str, prior: MotionDVAE, **changes: object) -> MotionDenoiser:
+    def trained(
+        self, name: str, prior: MotionDVAE, seed: int = 0, **changes: object
+    ) -> MotionDenoiser:
         """Return a denoiser trained here for as many steps as the included one."""
         settings, annealing = usual_denoiser_training("tiny" if self.quick else "small")
         trainee = DenoiserTrainee(
@@ -119,10 +129,11 @@ class Study:
             self.clips["validation"],
             prior,
             annealing=annealing,
+            seed=seed,
             **changes,  # type: ignore[arg-type]
         )
-        folder = self.out / "networks" / name
-        train(trainee, settings, folder, progress=not self.quick)
+        folder = self.out / "networks" / (f"{name}, seed {seed}" if seed else name)
+        train(trainee, replace(settings, seed=seed), folder, progress=not self.quick)
         return MotionDenoiser.load(folder, prior)
 
     def recordings(self, kind: str) -> list[Recording]:
@@ -250,8 +261,7 @@ def estimates(study: Study) -> dict[str, Estimate]:
     fit = DVAEInference(mode="optimization", iterations=50)
     regression = DVAEInference()
     known = mixture(study)
-    no_prior = study.trained("no prior", study.prior, latent_weight=0.0)
-    no_noise = study.trained("no noisy training", study.prior, noise=JointNoise.nearly_clean())
+    no_prior, no_noise = (study.trained(name, study.prior, **VARIANTS[name]) for name in VARIANTS)
     without_prior = replace(fit, latent_weight=0.0)
     return {
         "noisy input": noisy,
@@ -348,6 +358,38 @@ def table_row(recordings: list[Recording], estimate: Estimate) -> dict[str, floa
         "g_mpjpe_median": errors["g_mpjpe"].median(),
         "seconds_per_frame": seconds / frames,
     }
+
+
+def trainings(study: Study) -> pd.DataFrame:
+    """Return errors with denoisers trained with three seeds: mean and standard deviation.
+
+    A seed determines initial weights, batches and their noise; the motion prior and the recordings
+    are the same. Ratios are to the full denoiser of the same seed.
+    """
+    methods = {
+        "regression": DVAEInference(),
+        "optimization": DVAEInference(mode="optimization", iterations=50),
+    }
+    rows = []
+    for seed in range(3):
+        for variant in ("full", *VARIANTS):
+            changes = VARIANTS.get(variant, {})
+            network = study.trained(variant, study.prior, seed, **changes)
+            for kind in ("noise", "occluded"):
+                for name, method in methods.items():
+                    if variant == "no prior" and name == "optimization":
+                        method = replace(method, latent_weight=0.0)
+                    errors = table_row(study.recordings(kind), study.dvae(method, network))
+                    row = {"kind": kind, "estimate": name, "variant": variant, "seed": seed}
+                    print(row, errors.get("g_mpjpe"), flush=True)
+                    rows.append(row | errors)
+    index, columns = ["kind", "estimate", "variant"], ["g_mpjpe", "g_mpjpe_occluded"]
+    results = pd.DataFrame(rows).set_index([*index, "seed"])[columns]
+    full = results.xs("full", level="variant").reindex(results.index.droplevel("variant"))
+    results = results.join((results / full.to_numpy()).add_suffix("_over_full"))
+    table = results.groupby(level=index, sort=False).agg(["mean", "std"])
+    table.columns = ["_".join(names) for names in table.columns]
+    return table.reset_index()
 
 
 def speed(study: Study) -> pd.DataFrame:
@@ -508,7 +550,13 @@ def draw_accuracy(drawn: np.ndarray, truth: Motion, hidden: np.ndarray) -> dict[
     return row
 
 
-PARTS = {"table": table, "speed": speed, "recording": recording, "posterior": posterior}
+PARTS = {
+    "table": table,
+    "trainings": trainings,
+    "speed": speed,
+    "recording": recording,
+    "posterior": posterior,
+}
 
 
 def main() -> None:

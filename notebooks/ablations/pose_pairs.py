@@ -1,13 +1,14 @@
-"""Ablations of pose-pair sampling on CMU salsa: Yin et al. (2018), section 6, figures 6 to 9.
+"""Ablations of pose-pair sampling on CMU salsa: Yin et al. (2018), section 6, figures 6 to 11.
 
     python notebooks/ablations/pose_pairs.py --out pose-pairs
     python notebooks/ablations/pose_pairs.py --quick --out quick     (synthetic dances, minutes)
 
-``--parts`` selects noise, calibration, paired, truncation, velocity, coverage, embedding and
-completion; each writes a CSV file and figures to ``--out``. Draws are stored in
-``--out/comparisons`` (3 GB in total); run the same command again to resume an interrupted study.
-The parts embedding and completion use the draws of the part coverage. The data are located by
-:func:`probmotion.data.downloads.salsa_pairs`.
+``--parts`` selects noise, calibration, paired, truncation, velocity, converged, retrieval,
+coverage, embedding and completion; each writes a CSV file and figures to ``--out``. ``converged``
+and ``retrieval`` draw with ``tempered-pairs``, the others with ``mh`` from the seed, as in the
+paper. Draws are stored in ``--out/comparisons`` (3 GB in total); run the same command again to
+resume an interrupted study. The parts embedding and completion use the draws of the part coverage.
+The data are located by :func:`probmotion.data.downloads.salsa_pairs`.
 """
 
 from __future__ import annotations
@@ -45,8 +46,9 @@ from probmotion.interaction.completion import (
 )
 from probmotion.interaction.geometry.coordinates import align_rigidly
 from probmotion.interaction.geometry.pose_distances import MEASURES, pose_distances
-from probmotion.interaction.retrieval import views_around
+from probmotion.interaction.retrieval import retrieve, views_around
 from probmotion.metrics.coverage import coverage
+from probmotion.models.pose_pairs import PosePairPrior
 from probmotion.models.pose_pairs.pair_posterior import PairSettings, pair_posterior
 from probmotion.models.pose_pairs.single_pose_lifting import lift_people
 from probmotion.motion.skeleton import Skeleton
@@ -55,8 +57,9 @@ from probmotion.plots.coverage import classical_scaling, draw_coverage, draw_emb
 from probmotion.plots.pairs import draw_pairs
 from probmotion.posteriors.draws import MotionDraws
 from probmotion.posteriors.problem import Problem
+from probmotion.posteriors.sampling import Sampler
 from probmotion.posteriors.truncation import TruncatedPosterior, limit_for_dimension
-from probmotion.samplers import MetropolisHastings
+from probmotion.samplers import MetropolisHastings, TemperedPairs
 from probmotion.samplers.mcmc.proposals import Isotropic, Proposal, VelocityBiased
 
 SEED = 0
@@ -149,6 +152,20 @@ class Study:
 
         Each repeat has different annotations and views and is a separate problem.
         """
+        samplers = {
+            name: MetropolisHastings(proposal, warmup=self.warmup, thin=1)
+            for name, proposal in (proposals or {"isotropic": Isotropic(0.02)}).items()
+        }
+        return self.compared(part, settings, samplers, draws or self.draws // 10)
+
+    def compared(
+        self,
+        part: str,
+        settings: Mapping[str, Mapping[str, Any]],
+        samplers: Mapping[str, Sampler],
+        draws: int,
+    ) -> Runs:
+        """Return the comparison of samplers on the posteriors with these settings."""
         problems = {
             name: Problem(
                 name,
@@ -158,14 +175,10 @@ class Study:
             )
             for name, changes in settings.items()
         }
-        samplers = {
-            name: MetropolisHastings(proposal, warmup=self.warmup, thin=1)
-            for name, proposal in (proposals or {"isotropic": Isotropic(0.02)}).items()
-        }
         comparison = compare(
             problems,
             samplers,
-            draws=draws or self.draws // 10,
+            draws=draws,
             chains=self.chains,
             out=self.out / "comparisons" / part,
             workers=0,
@@ -185,6 +198,24 @@ class Study:
             for repeat in range(1 if density == "shape-context" else self.repeats)
         }
         return self.run("coverage", problems, draws=self.draws)
+
+    @cached_property
+    def by_tempering(self) -> Runs:
+        """Draws of parallel tempering from densities without truncation.
+
+        Both coordinates have the same annotations and views.
+        """
+        problems = {
+            f"{density} {size}, repeat {repeat}": {
+                "density": density, "noise": size, "repeat": repeat, "limit": np.inf,
+            }
+            for repeat in range(self.repeats)
+            for size in (0.005, 0.01)
+            for density in ("interaction", "cartesian")
+        }  # fmt: skip
+        effort = {"warmup": 30, "thin": 2} if self.quick else {"warmup": 600, "thin": 10}
+        samplers = {"tempered-pairs": TemperedPairs(levels=24, steps=120, **effort)}
+        return self.compared("converged", problems, samplers, 400)
 
     def table(
         self, runs: Runs, fewer: Sequence[int] = (), also: Sequence[str] = ()
@@ -337,6 +368,92 @@ def truncation(study: Study) -> pd.DataFrame:
     return study.table(study.run("truncation", problems), also=("at_cap", "near_floor"))
 
 
+def converged(study: Study) -> pd.DataFrame:
+    """Return coverage by draws of parallel tempering, of held-out and of annotated pairs."""
+    runs, rows = study.by_tempering, []
+    if (draws := runs.draws("interaction 0.01, repeat 0", "tempered-pairs")) is not None:
+        sets = {"real": evenly(study.held_out, 150), "posterior": evenly(step_by_step(draws), 200)}
+        embed(sets | {"seed": study.seed_pose[None]}, study.out / "figure8-converged.png")
+    for run in runs.comparison.results:
+        row = dict(runs.settings[run.problem])
+        draws = runs.draws(run.problem, run.sampler)
+        if draws is None:
+            rows.append(row | {"failed": str(run.failure)})
+            continue
+        annotated = evenly(study.drawn_annotations(row["repeat"]).positions, study.n_held_out)
+        poses = step_by_step(draws)
+        row |= {name: run.metrics[name] for name in ("rhat", "seconds")}
+        for measure in MEASURES:
+            for pairs, truth in (("held-out", study.held_out), ("annotated", annotated)):
+                value = float(coverage(truth, poses, measure))
+                rows.append({"measure": measure, "pairs": pairs, "coverage": value, **row})
+    return pd.DataFrame(rows)
+
+
+def retrieval(study: Study) -> pd.DataFrame:
+    """Return errors in 3D of pairs found for held-out annotations (figures 10 and 11), metres.
+
+    Lifted pairs have valid joint angles. Naive samples are a thousand of those around the lifted
+    pair. Of these, and of the draws of parallel tempering, the nearest to the annotation is found.
+    """
+    draws = study.by_tempering.draws("interaction 0.01, repeat 0", "tempered-pairs")
+    if draws is None:
+        raise RuntimeError("retrieval needs the draws of converged, which failed")
+    states, skeleton = step_by_step(draws), Skeleton.preset("pair17")
+    prior = study.posterior().prior
+    frames = [dance_frames(clip) for clip in study.clips[1]]
+    test = draw_annotations(study.clips[1], 8 if study.quick else 60, SEED, frames=frames)
+    views = annotation_views(test.annotations, study.seed_pose)
+    rows, shown_pairs = [], {name: [] for name in ("annotation", "lifting", "naive", "draws")}
+    for index, (keypoints, view) in enumerate(zip(test.annotations.keypoints, views, strict=True)):
+        around = views_around(view)
+        every = np.ones(skeleton.n_joints, dtype=bool)
+        lifted = lift_people(keypoints, every, study.seed_pose, skeleton, view)
+        naive = samples_around(lifted, prior, seeds.generator(SEED, "naive", index))
+        found = {"lifting": lifted}
+        for name, poses in (("naive", naive), ("draws", states)):
+            nearest = retrieve(keypoints, poses, skeleton, views=around)
+            found[name] = poses[int(nearest.indices[0])]
+        truth = test.positions[index]
+        shown_pairs["annotation"].append(keypoints)
+        for name, pose in found.items():
+            aligned = align_rigidly(pose, truth)
+            error = np.linalg.norm(aligned - truth, axis=-1).mean()
+            rows.append({"method": name, "pair": index, "error": error})
+            turned = project_to_views(pose[None], view[None], skeleton)[0, 0]
+            shown_pairs[name].append(turned)
+    draw_pairs(shown_pairs, skeleton, study.out / "figure10.png", columns=4)
+    draw_nearest(study, evenly(states, 4)[:4])
+    return pd.DataFrame(rows)
+
+
+def samples_around(
+    lifted: np.ndarray, prior: PosePairPrior, rng: np.random.Generator
+) -> np.ndarray:
+    """Return the most plausible 1000 of 4000 pairs around a lifted one, with its bone lengths."""
+    theta = np.repeat(prior.coordinates(lifted)[None], 4000, axis=0)
+    spread = np.full(prior.dim, 0.1)  # radians and metres
+    spread[6 * len(prior.skeleton.roots) + 2 :: 3] = 0.0
+    poses = prior.motion(theta + spread * rng.standard_normal(theta.shape))
+    order = np.argsort(-prior.log_plausibility(poses), kind="stable")
+    return poses[order[:1000], 0]
+
+
+def draw_nearest(study: Study, poses: np.ndarray) -> None:
+    """Plot pairs in the views in which annotations are nearest, with these (figure 11)."""
+    skeleton = Skeleton.preset("pair17")
+    annotated = study.drawn_annotations(0).annotations
+    rows = {name: [] for name in ("draw", "nearest", "second", "third")}
+    for pose in poses:
+        found = retrieve(annotated.keypoints, pose[None], skeleton)
+        nearest = np.argsort(found.distances[:, 0], kind="stable")[:3]
+        view = found.views[nearest[0], 0]
+        rows["draw"].append(project_to_views(pose[None], view[None], skeleton)[0, 0])
+        for name, index in zip(list(rows)[1:], nearest, strict=True):
+            rows[name].append(annotated.keypoints[index])
+    draw_pairs(rows, skeleton, study.out / "figure11.png", columns=4)
+
+
 def velocity(study: Study) -> pd.DataFrame:
     """Return coverage by proposal at equal acceptance and number of draws (figure 7)."""
     proposals = {
@@ -396,12 +513,19 @@ def embedding(study: Study) -> pd.DataFrame:
             states = evenly(step_by_step(draws), 2000)
             sets[kind] = np.concatenate([states[:20:2], states[20:200:4], states[200::18]])
     sets["seed"] = study.seed_pose[None]
+    counts = {f"{study.draws // 100} draws": 10, f"{study.draws // 10} draws": 55}
+    counts[f"{study.draws} draws"] = sum(map(len, sets.values()))
+    return embed(sets, study.out / "figure8.png", counts)
+
+
+def embed(
+    sets: Mapping[str, np.ndarray], path: Path, counts: Mapping[str, int] | None = None
+) -> pd.DataFrame:
+    """Plot poses by multidimensional scaling of interaction distances; return coordinates."""
     poses = np.concatenate(list(sets.values()))
     kinds = [kind for kind, members in sets.items() for _ in members]
     points = classical_scaling(pose_distances(poses, poses, "interaction"))
-    counts = {f"{study.draws // 100} draws": 10, f"{study.draws // 10} draws": 55}
-    counts[f"{study.draws} draws"] = len(poses)
-    draw_embedding(points, kinds, study.out / "figure8.png", counts=counts)
+    draw_embedding(points, kinds, path, counts=counts)
     return pd.DataFrame({"kind": kinds, "x": points[:, 0], "y": points[:, 1]})
 
 
@@ -451,6 +575,8 @@ PARTS: dict[str, Callable[[Study], pd.DataFrame]] = {
     "paired": paired,
     "truncation": truncation,
     "velocity": velocity,
+    "converged": converged,
+    "retrieval": retrieval,
     "coverage": densities,
     "embedding": embedding,
     "completion": completion,
@@ -460,8 +586,15 @@ PARTS: dict[str, Callable[[Study], pd.DataFrame]] = {
 def shown(name: str, table: pd.DataFrame) -> pd.DataFrame:
     """Return the printed table of a part: means over chains and pairs."""
     keys = [k for k in ("density", "proposal", "noise", "limit", "draws") if k in table]
-    if name == "completion":
+    if name in ("completion", "retrieval"):
         return table.groupby("method")["error"].agg(["mean", "median", "sem"]).round(4)
+    if name == "converged":
+        settings = ["measure", "pairs", "noise"]
+        wide = table.pivot_table("coverage", [*settings, "repeat"], "density")
+        wide["difference"] = wide["interaction"] - wide["cartesian"]
+        means = wide.groupby(level=settings).agg(["mean", "sem"])
+        means.columns = [" ".join(names).removesuffix(" mean") for names in means.columns]
+        return means.round(4)
     if "measure" not in table:
         return table if name == "calibration" else table.groupby("kind").size().to_frame("poses")
     columns = [
