@@ -26,6 +26,7 @@ ROWS: tuple[tuple[str, str, float, Mapping[str, Sampler]], ...] = (
     ("walk_vae_monocular_best_swd_60s", "walk-vae-monocular", 60.0, BOTH),
     # Runs have one core: 240 s are 120 s of two cores.
     ("salsa_pairs_swd_120s", "salsa-pairs", 240.0, PAIRS),
+    ("salsa_pairs_swd_300s", "salsa-pairs", 600.0, PAIRS),
     ("dance_pairs_swd_120s", "dance-pairs", 240.0, PAIRS),
 )
 """Name, problem, seconds per run, and samplers."""

@@ -404,7 +404,8 @@ def retrieval(study: Study) -> pd.DataFrame:
     frames = [dance_frames(clip) for clip in study.clips[1]]
     test = draw_annotations(study.clips[1], 8 if study.quick else 60, SEED, frames=frames)
     views = annotation_views(test.annotations, study.seed_pose)
-    rows, shown_pairs = [], {name: [] for name in ("annotation", "lifting", "naive", "draws")}
+    rows: list[dict[str, object]] = []
+    pictures: dict[str, list[np.ndarray]] = {}
     for index, (keypoints, view) in enumerate(zip(test.annotations.keypoints, views, strict=True)):
         around = views_around(view)
         every = np.ones(skeleton.n_joints, dtype=bool)
@@ -415,14 +416,16 @@ def retrieval(study: Study) -> pd.DataFrame:
             nearest = retrieve(keypoints, poses, skeleton, views=around)
             found[name] = poses[int(nearest.indices[0])]
         truth = test.positions[index]
-        shown_pairs["annotation"].append(keypoints)
+        pictures.setdefault("annotation", []).append(keypoints)
+        side = view[None] + np.array([np.pi / 2, 0.0])
+        for name, pose in {"truth": truth, **found}.items():
+            image = project_to_views(pose[None], side, skeleton)[0, 0]
+            pictures.setdefault(f"{name},\nfrom the side", []).append(image)
         for name, pose in found.items():
-            aligned = align_rigidly(pose, truth)
-            error = np.linalg.norm(aligned - truth, axis=-1).mean()
+            error = np.linalg.norm(align_rigidly(pose, truth) - truth, axis=-1).mean()
             rows.append({"method": name, "pair": index, "error": error})
-            turned = project_to_views(pose[None], view[None], skeleton)[0, 0]
-            shown_pairs[name].append(turned)
-    draw_pairs(shown_pairs, skeleton, study.out / "figure10.png", columns=4)
+    images_of = {label: np.stack(images) for label, images in pictures.items()}
+    draw_pairs(images_of, skeleton, study.out / "figure10.png", columns=4)
     draw_nearest(study, evenly(states, 4)[:4])
     return pd.DataFrame(rows)
 
@@ -443,14 +446,15 @@ def draw_nearest(study: Study, poses: np.ndarray) -> None:
     """Plot pairs in the views in which annotations are nearest, with these (figure 11)."""
     skeleton = Skeleton.preset("pair17")
     annotated = study.drawn_annotations(0).annotations
-    rows = {name: [] for name in ("draw", "nearest", "second", "third")}
+    columns = []
     for pose in poses:
         found = retrieve(annotated.keypoints, pose[None], skeleton)
         nearest = np.argsort(found.distances[:, 0], kind="stable")[:3]
         view = found.views[nearest[0], 0]
-        rows["draw"].append(project_to_views(pose[None], view[None], skeleton)[0, 0])
-        for name, index in zip(list(rows)[1:], nearest, strict=True):
-            rows[name].append(annotated.keypoints[index])
+        image = project_to_views(pose[None], view[None], skeleton)[0, 0]
+        columns.append([image, *annotated.keypoints[nearest]])
+    labels = ("draw", "nearest\nannotation", "second", "third")
+    rows = dict(zip(labels, map(np.stack, zip(*columns, strict=True)), strict=True))
     draw_pairs(rows, skeleton, study.out / "figure11.png", columns=4)
 
 
