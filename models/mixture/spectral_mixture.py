@@ -453,7 +453,7 @@ class SpectralMixtureMotion:
             archive = read_arrays(path)
             header = json.loads(str(archive["header"]))
             if header["format"] != _FORMAT:
-                raise ValueError(f"format {header['format']}")
+                raise ValueError(f"format {header['format']}: fit and save the prior again")
             arrays: dict[str, Any] = {name: archive[name] for name in (*_ROUNDED, *_EXACT)}
             for name, array in arrays.items():
                 if array.dtype.kind != ("i" if name == "band" else "f"):

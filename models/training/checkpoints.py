@@ -48,7 +48,7 @@ _TRAIN = {
     "motion-vae-poses": "probmotion train motion-vae",
     "motion-vae-encoder": "probmotion train motion-vae",
     "image-encoder": "probmotion train images",
-    "joint-corrector": "python notebooks/ship_joint_corrector.py",
+    "joint-corrector": "python notebooks/ship_joint_corrector.py --data DATA --pairs DIR",
 }  # command that trains a kind of network
 _ENTRY = "probmotion"  # key of the header's metadata
 
@@ -132,7 +132,9 @@ def load_checkpoint(source: str | Path, kind: str) -> Checkpoint:
     ) as error:  # fmt: skip
         raise CheckpointError(f"{path} is damaged or not a safetensors file: {error}") from error
     if not isinstance(header, dict) or "format" not in header:
-        raise CheckpointError(f"{path} must be a checkpoint of probmotion, got no header")
+        raise CheckpointError(
+            f"{path} must be a checkpoint of probmotion, got no header{_train_again(kind)}"
+        )
     if header.get("kind") != kind:
         raise CheckpointError(f"{path} must contain a {kind}, got a {header.get('kind')}")
     if header["format"] != _FORMAT:

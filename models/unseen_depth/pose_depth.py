@@ -208,7 +208,10 @@ class PoseDepth:
             archive = read_arrays(path)
             header = json.loads(str(archive.pop("header")))
             if header["format"] != _FORMAT:
-                raise ValueError(f"format {header['format']}")
+                raise ValueError(
+                    f"format {header['format']}; learn it again: "
+                    "python notebooks/ship_pose_depth.py --data DATA --out DIR"
+                )
             floats = {
                 name: array.astype(np.float64, casting="safe") for name, array in archive.items()
             }

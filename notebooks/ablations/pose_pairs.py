@@ -203,16 +203,20 @@ class Study:
     def by_tempering(self) -> Runs:
         """Draws of parallel tempering from densities without truncation.
 
-        Both coordinates have the same annotations and views.
+        Both coordinates have the same annotations and views. Of 5599 annotations, 855 are among the
+        nearest ones of 32 views, and 5596 among those of 2048.
         """
-        problems = {
-            f"{density} {size}, repeat {repeat}": {
-                "density": density, "noise": size, "repeat": repeat, "limit": np.inf,
-            }
-            for repeat in range(self.repeats)
+        variants: dict[str, dict[str, Any]] = {
+            f"{density} {size}": {"density": density, "noise": size}
             for size in (0.005, 0.01)
             for density in ("interaction", "cartesian")
-        }  # fmt: skip
+        }
+        variants["2048 views"] = {"density": "interaction", "noise": 0.01, "n_views": 2048}
+        problems = {
+            f"{name}, repeat {repeat}": settings | {"repeat": repeat, "limit": np.inf}
+            for repeat in range(self.repeats)
+            for name, settings in variants.items()
+        }
         effort = {"warmup": 30, "thin": 2} if self.quick else {"warmup": 600, "thin": 10}
         samplers = {"tempered-pairs": TemperedPairs(levels=24, steps=120, **effort)}
         return self.compared("converged", problems, samplers, 400)
@@ -380,6 +384,8 @@ def converged(study: Study) -> pd.DataFrame:
         if draws is None:
             rows.append(row | {"failed": str(run.failure)})
             continue
+        if "n_views" in row:
+            row["density"] = f"{row['density']}, {row['n_views']} views"
         annotated = evenly(study.drawn_annotations(row["repeat"]).positions, study.n_held_out)
         poses = step_by_step(draws)
         row |= {name: run.metrics[name] for name in ("rhat", "seconds")}
@@ -595,7 +601,8 @@ def shown(name: str, table: pd.DataFrame) -> pd.DataFrame:
     if name == "converged":
         settings = ["measure", "pairs", "noise"]
         wide = table.pivot_table("coverage", [*settings, "repeat"], "density")
-        wide["difference"] = wide["interaction"] - wide["cartesian"]
+        for other in wide.columns.drop("interaction"):
+            wide[f"{other}, difference"] = wide[other] - wide["interaction"]
         means = wide.groupby(level=settings).agg(["mean", "sem"])
         means.columns = [" ".join(names).removesuffix(" mean") for names in means.columns]
         return means.round(4)

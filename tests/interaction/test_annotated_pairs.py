@@ -81,6 +81,22 @@ def test_fresh_views_are_unbiased():
     assert abs(np.exp(log_density.mean()) - truth) > 4 * error
 
 
+def test_many_views_approach_the_integral_over_a_fine_grid_of_views():
+    """Equation 6 by brute force: midpoints of cells of 2 by 2 degrees, each with density f(v)."""
+    many = AnnotatedPairs(ANNOTATIONS, n_views=4096, n_near=8, noise=0.1)
+    phi, theta = np.radians(np.arange(-179, 180, 2)), np.radians(np.arange(1, 180, 2))
+    grid = np.stack(np.meshgrid(phi, theta, indexing="ij"), axis=-1).reshape(-1, 2)
+    projections = project_to_views(POSES[:, 0], grid, many.skeleton)
+    near = many.distribution.near(grid, 8)
+    terms = np.exp(many.comparer.log_terms(projections, near, many.noise))
+    cells = np.exp(many.distribution.log_density(grid)) * np.radians(2) ** 2
+    assert cells.sum() == pytest.approx(1, abs=1e-3)
+    integral = terms @ cells
+    error = np.sqrt((terms**2 @ cells - integral**2) / many.n_views)
+    assert (error < 0.05 * integral).all()
+    assert (np.abs(np.exp(many.log_density(POSES)) - integral) < 4 * error).all()
+
+
 def test_each_estimate_depends_on_its_generator_only():
     estimator = AnnotatedPairs(ANNOTATIONS, n_views=4, n_near=8)
     single, _ = estimator.evaluate(POSES[2:3], [np.random.default_rng(7)])

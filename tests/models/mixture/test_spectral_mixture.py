@@ -166,6 +166,7 @@ def test_unreadable_files_are_rejected(prior, tmp_path):
         ("poses", 1e200, "scale must be a finite number"),
         ("band", np.float64(0), "band has the type float64"),
         ("ground", 1e308, "Numerical result out of range"),
+        ("format", 0, "format 0: fit and save the prior again"),
     ],
 )
 def test_damaged_files_are_rejected(name, value, message, prior, tmp_path):
