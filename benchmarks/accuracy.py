@@ -398,9 +398,9 @@ def learnt_figures(folder: Path) -> Figures:
     """Yield errors of means corrected by networks over those of the spectral prior alone.
 
     Same windows as above, one draw of the noise. ``dvae_regression``: the network
-    `joint-corrector` alone; ``dvae``: followed by 50 iterations of the Motion-DVAE. Both are also
-    compared with a Kalman smoother. Acceleration ratios are to the truth, of draws (median over
-    draws) and of means.
+    `joint-corrector` alone; ``dvae``: followed by 50 iterations of the Motion-DVAE, whose gain is
+    the difference. Both are also compared with a Kalman smoother. Acceleration ratios are to the
+    truth, of draws (median over draws) and of means.
     """
     kinds, methods = ("noise", "all", "occluded"), ("dvae", "dvae_regression")
     errors: dict[str, list[list[float]]] = {kind: [] for kind in kinds}
@@ -449,6 +449,10 @@ def learnt_figures(folder: Path) -> Figures:
             yield f"{method}_over_spectral_{name}", ratio
             error = (own - ratio * spectral).std(ddof=1) / np.sqrt(len(own)) / spectral.mean()
             yield f"{method}_over_spectral_{name}_standard_error", error
+            if number == 0:
+                gain = (columns[1] - own) / spectral.mean()
+                yield f"dvae_gain_{name}", gain.mean()
+                yield f"dvae_gain_{name}_standard_error", gain.std(ddof=1) / np.sqrt(len(gain))
         both = np.mean([*errors["noise"], *errors["all"]], axis=0)
         yield f"{method}_over_kalman", both[number] / both[3]
     for figure, values in rows.items():

@@ -6,7 +6,7 @@
 ``--parts`` selects table, trainings, speed, recording and posterior. Recordings are simulated from held-out
 clips with noise, outliers and occluded limbs. The package includes the prior and its denoiser; the
 networks of the ablations "no prior" and "no noisy training" are trained here for as many steps, for
-``trainings`` with three seeds each, beside the full network.
+``trainings`` with the seeds of ``--seeds``, beside the full network.
 Draws are stored in ``--out/comparisons``. Clips are read from ``--data``, by default
 ../shared/data of the repository.
 """
@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -94,6 +94,7 @@ class Study:
     quick: bool
     per_clip: int
     seed: int = 0
+    seeds: Sequence[int] = (0, 1, 2)
 
     @cached_property
     def clips(self) -> dict[str, list[Motion]]:
@@ -361,7 +362,7 @@ def table_row(recordings: list[Recording], estimate: Estimate) -> dict[str, floa
 
 
 def trainings(study: Study) -> pd.DataFrame:
-    """Return errors with denoisers trained with three seeds: mean and standard deviation.
+    """Return errors with denoisers trained with several seeds: mean and standard deviation.
 
     A seed determines initial weights, batches and their noise; the motion prior and the recordings
     are the same. Ratios are to the full denoiser of the same seed.
@@ -371,7 +372,7 @@ def trainings(study: Study) -> pd.DataFrame:
         "optimization": DVAEInference(mode="optimization", iterations=50),
     }
     rows = []
-    for seed in range(3):
+    for seed in study.seeds:
         for variant in ("full", *VARIANTS):
             changes = VARIANTS.get(variant, {})
             network = study.trained(variant, study.prior, seed, **changes)
@@ -569,9 +570,12 @@ def main() -> None:
     parser.add_argument("--parts", nargs="+", choices=names, default=names, help="Parts to run.")
     parser.add_argument("--quick", action="store_true", help="Synthetic clips and tiny networks.")
     parser.add_argument("--per-clip", type=int, default=6, help="Recordings per test clip.")
+    parser.add_argument(
+        "--seeds", nargs="+", type=int, default=[0, 1, 2], help="Seeds of the part trainings."
+    )
     options = parser.parse_args()
     per_clip = 2 if options.quick else options.per_clip
-    study = Study(options.out, options.data, options.quick, per_clip)
+    study = Study(options.out, options.data, options.quick, per_clip, seeds=options.seeds)
     options.out.mkdir(parents=True, exist_ok=True)
     for part in options.parts:
         if part == "recording" and study.quick:
