@@ -3,12 +3,12 @@
     python notebooks/ablations/motion_dvae.py --out dvae
     python notebooks/ablations/motion_dvae.py --quick --out quick   (synthetic clips, tiny networks)
 
-``--parts`` selects table, trainings, speed, recording and posterior. Recordings are simulated from held-out
-clips with noise, outliers and occluded limbs. The package includes the prior and its denoiser; the
-networks of the ablations "no prior" and "no noisy training" are trained here for as many steps, for
-``trainings`` with the seeds of ``--seeds``, beside the full network.
-Draws are stored in ``--out/comparisons``. Clips are read from ``--data``, by default
-../shared/data of the repository.
+``--parts`` selects table, trainings, speed, recording and posterior. Recordings are simulated from
+held-out clips with noise, outliers and occluded limbs. The package includes the prior and its
+denoiser; the networks of the ablations "no prior" and "no noisy training" are trained here for as
+many steps, for ``trainings`` with the seeds of ``--seeds``, beside the full network. Draws are
+stored in ``--out/comparisons``. Clips are read from ``--data``, by default ../shared/data of the
+repository.
 """
 
 from __future__ import annotations
@@ -365,7 +365,7 @@ def trainings(study: Study) -> pd.DataFrame:
     """Return errors with denoisers trained with several seeds: mean and standard deviation.
 
     A seed determines initial weights, batches and their noise; the motion prior and the recordings
-    are the same. Ratios are to the full denoiser of the same seed.
+    are the same.
     """
     methods = {
         "regression": DVAEInference(),
@@ -385,10 +385,7 @@ def trainings(study: Study) -> pd.DataFrame:
                     print(row, errors.get("g_mpjpe"), flush=True)
                     rows.append(row | errors)
     index, columns = ["kind", "estimate", "variant"], ["g_mpjpe", "g_mpjpe_occluded"]
-    results = pd.DataFrame(rows).set_index([*index, "seed"])[columns]
-    full = results.xs("full", level="variant").reindex(results.index.droplevel("variant"))
-    results = results.join((results / full.to_numpy()).add_suffix("_over_full"))
-    table = results.groupby(level=index, sort=False).agg(["mean", "std"])
+    table = pd.DataFrame(rows).groupby(index, sort=False)[columns].agg(["mean", "std"])
     table.columns = ["_".join(names) for names in table.columns]
     return table.reset_index()
 

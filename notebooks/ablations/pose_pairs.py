@@ -412,9 +412,9 @@ def retrieval(study: Study) -> pd.DataFrame:
     views = annotation_views(test.annotations, study.seed_pose)
     rows: list[dict[str, object]] = []
     pictures: dict[str, list[np.ndarray]] = {}
+    every = np.ones(skeleton.n_joints, dtype=bool)
     for index, (keypoints, view) in enumerate(zip(test.annotations.keypoints, views, strict=True)):
         around = views_around(view)
-        every = np.ones(skeleton.n_joints, dtype=bool)
         lifted = lift_people(keypoints, every, study.seed_pose, skeleton, view)
         naive = samples_around(lifted, prior, seeds.generator(SEED, "naive", index))
         found = {"lifting": lifted}
@@ -423,10 +423,9 @@ def retrieval(study: Study) -> pd.DataFrame:
             found[name] = poses[int(nearest.indices[0])]
         truth = test.positions[index]
         pictures.setdefault("annotation", []).append(keypoints)
-        side = view[None] + np.array([np.pi / 2, 0.0])
+        side = view + np.array([np.pi / 2, 0.0])
         for name, pose in {"truth": truth, **found}.items():
-            image = project_to_views(pose[None], side, skeleton)[0, 0]
-            pictures.setdefault(f"{name},\nfrom the side", []).append(image)
+            pictures.setdefault(f"{name},\nfrom the side", []).append(seen_from(side, pose))
         for name, pose in found.items():
             error = np.linalg.norm(align_rigidly(pose, truth) - truth, axis=-1).mean()
             rows.append({"method": name, "pair": index, "error": error})
@@ -434,6 +433,12 @@ def retrieval(study: Study) -> pd.DataFrame:
     draw_pairs(images_of, skeleton, study.out / "figure10.png", columns=4)
     draw_nearest(study, evenly(states, 4)[:4])
     return pd.DataFrame(rows)
+
+
+def seen_from(view: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Return a pair (J, 3) with x to the right, y up and no depth in a view (2,), for pictures."""
+    image = project_to_views(pose[None], view[None], Skeleton.preset("pair17"))[0, 0]
+    return np.pad(image, ((0, 0), (0, 1)))
 
 
 def samples_around(
@@ -452,15 +457,14 @@ def draw_nearest(study: Study, poses: np.ndarray) -> None:
     """Plot pairs in the views in which annotations are nearest, with these (figure 11)."""
     skeleton = Skeleton.preset("pair17")
     annotated = study.drawn_annotations(0).annotations
-    columns = []
+    pairs, near = [], []
     for pose in poses:
         found = retrieve(annotated.keypoints, pose[None], skeleton)
         nearest = np.argsort(found.distances[:, 0], kind="stable")[:3]
-        view = found.views[nearest[0], 0]
-        image = project_to_views(pose[None], view[None], skeleton)[0, 0]
-        columns.append([image, *annotated.keypoints[nearest]])
-    labels = ("draw", "nearest\nannotation", "second", "third")
-    rows = dict(zip(labels, map(np.stack, zip(*columns, strict=True)), strict=True))
+        pairs.append(seen_from(found.views[nearest[0], 0], pose))
+        near.append(annotated.keypoints[nearest])
+    labels = ("nearest\nannotation", "second", "third")
+    rows = {"draw": np.array(pairs), **dict(zip(labels, np.swapaxes(near, 0, 1), strict=True))}
     draw_pairs(rows, skeleton, study.out / "figure11.png", columns=4)
 
 
