@@ -32,6 +32,7 @@ _WINDOWS = 8192  # most windows of the tracks; fewer if there are fewer frames
 _BATCH = 256
 _SIMULATED = 8192  # codes whose keypoints are simulated
 _COMPONENTS, _WINDOWS_PER_COMPONENT = 32, 64
+_ROUNDS = 2  # codes of windows differ once the encoder is calibrated; a third changes little
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,6 +178,9 @@ def with_learnt_codes(
 ) -> MotionVAE:
     """Return the prior with the distribution of its training codes and a calibrated encoder.
 
+    The encoder is calibrated to the codes that it has of training windows, twice, since these
+    change with it; the mixture is that of the second time.
+
     Parameters
     ----------
     trainee : MotionVAETrainee
@@ -186,18 +190,20 @@ def with_learnt_codes(
     settings : TrainingSettings
         Of the third phase.
     folder : str or Path
-        Folder of its run.
+        Folder of its two runs.
     learn : callable
         Trains the encoder, as :func:`~probmotion.models.training.trainer.train`.
     """
-    windows = EncodedWindows.of(trainee, prior.model)
+    model = prior.model
+    for number in range(_ROUNDS):
+        windows = EncodedWindows.of(trainee, model)
+        encoder = EncoderTrainee(trainee, model, windows)
+        learn(encoder, settings, Path(folder) / str(number))
+        model = encoder.learnt(Path(folder) / str(number))
     mean, log_variance = windows.mean.double().numpy(), windows.log_variance.double().numpy()
     rng = seeds.generator(0, "codes")
     components = min(_COMPONENTS, max(1, len(mean) // _WINDOWS_PER_COMPONENT))
     codes = CodeMixture.fit(mean, np.exp(log_variance), components, rng)
-    encoder = EncoderTrainee(trainee, prior.model, windows)
-    learn(encoder, settings, folder)
-    model = encoder.learnt(folder)
     card = {**prior.card, "deviation": windows.deviation}
     given = model.vae, model.pose, prior.settings, prior.body, prior.fps
     return MotionVAE(*given, card=card, codes=codes)

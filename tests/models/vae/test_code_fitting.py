@@ -81,6 +81,9 @@ def test_calibrated_encoder_covers_the_codes_that_it_is_shown(trainee, windows, 
     settings = TrainingSettings(steps=400, batch=64, learning_rate=3e-3, ema=0.97, warmup=20)
     learn = partial(train, progress=False)
     learnt = with_learnt_codes(trainee, prior, settings, tmp_path, learn=learn)
+    # The codes that the second calibration is shown, encoded by the first.
+    first = EncoderTrainee(trainee, prior.model, windows).learnt(tmp_path / "0")
+    windows = EncodedWindows.of(trainee, first)
     z, keypoints, seen = windows.simulated(prior.model, trainee.body, 7.0, rng(), 3000)
     rest = torch.as_tensor(trainee.body.rest_positions, dtype=torch.float32)
     shares, errors = [], []
