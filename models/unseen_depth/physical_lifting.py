@@ -9,9 +9,10 @@ posterior of annotation y,
 
     p(X | y) ∝ N(X) f(X) b(X) p(y | X),
 
-is sampled by Metropolis steps. They start from a draw without f, or, if it has too many invalid
-joint angles, from the nearest valid pose. Views of less than a thousandth of the largest
-probability are left out.
+is sampled by parallel tempering with Metropolis steps. Replicas differ in the power of b(X): where
+bones may shorten, limbs can pass through the image plane, from one order in depth to the other.
+Replicas start from draws of N(X) p(y | X) or, if these have too many invalid joint angles, from the
+nearest valid poses. Views of less than a thousandth of the largest probability are left out.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ from probmotion.validation import check_count
 
 __all__ = ["physical_lifts"]
 
+_POWERS = np.geomspace(0.15, 1.0, 6)  # of b(X); neighbours are swapped about half of the time
 _INITIAL_SIZE = 0.03  # of the steps, radians, metres or log length
 _LEAST_VARIANCE = 1e-9  # relative; the variance of the mean depth is 0
 
@@ -51,8 +53,8 @@ def physical_lifts(
     physics: PosePairPrior,
     *,
     draws: int = 1,
-    warmup: int = 8000,
-    steps: int = 2000,
+    warmup: int = 64,
+    sweeps: int = 32,
     seed: int = 0,
     progress: bool = False,
 ) -> np.ndarray:
@@ -71,9 +73,10 @@ def physical_lifts(
     draws : int
         Number of states of each annotation's chain.
     warmup : int
-        Number of Metropolis steps that tune step sizes, about 5 µs each.
-    steps : int
-        Number of steps before each draw.
+        Number of sweeps that tune step sizes. A sweep is 50 Metropolis steps of each of six
+        replicas, 1.5 to 3 ms.
+    sweeps : int
+        Number of sweeps before each draw.
     seed : int
         Random seed. Draws of an annotation do not depend on other annotations or on ``draws``.
     progress : bool
@@ -104,7 +107,7 @@ def physical_lifts(
             )
     check_count("draws", draws)
     check_count("warmup", warmup)
-    check_count("steps", steps)
+    check_count("sweeps", sweeps)
     keypoints = as_keypoints(annotations, prior.n_joints)
     check_size(keypoints, prior.means[0], "multiply them by lift(…, unknown_scale=True).scales")
     images, centres = centred_images(keypoints)
@@ -114,19 +117,20 @@ def physical_lifts(
 
     def walk(mixture: _Mixture) -> None:
         rng = seeds.generator(seed, "physical lift", mixture.row)
-        pose, component = mixture.draw(rng)
-        log_sizes = np.full((2, APPROACH), math.log(_INITIAL_SIZE))
-        if (~physics.joint_limits.is_valid(pose)).sum() > physics.max_invalid:
-            pose = physics.joint_limits.nearest_valid(pose)
+        poses = np.stack([mixture.draw(rng) for _ in _POWERS])
+        for pose in poses:
+            if (~physics.joint_limits.is_valid(pose)).sum() > physics.max_invalid:
+                pose[:] = physics.joint_limits.nearest_valid(pose)
+        log_sizes = np.full((len(_POWERS), 2, APPROACH), math.log(_INITIAL_SIZE))
         for number in range(-1, draws):
-            component = walk_lift(
-                pose, component, mixture.log_weights, mixture.means, mixture.cells, mixture.roots,
-                warmup if number < 0 else steps, moves, log_sizes, number < 0, physics.body,
+            walk_lift(
+                poses, _POWERS, mixture.log_weights, mixture.means, mixture.cells, mixture.roots,
+                warmup if number < 0 else sweeps, moves, log_sizes, number < 0, physics.body,
                 physics.physics, rng,
             )  # fmt: skip
-            pose[:, 2] -= pose[:, 2].mean()
+            poses[..., 2] -= poses[..., 2].mean(axis=1, keepdims=True)
             if number >= 0:
-                out[number, mixture.row] = pose
+                out[number, mixture.row] = poses[-1]
 
     cores = 1 if only_one_thread() else os.cpu_count() or 1
     with progress_bar(len(images), "lifts", progress) as bar, ThreadPoolExecutor(cores) as threads:
@@ -154,12 +158,12 @@ class _Mixture(NamedTuple):
     roots: np.ndarray
     spreads: np.ndarray
 
-    def draw(self, rng: np.random.Generator) -> tuple[np.ndarray, int]:
-        """Return a pose (J, 3) and its component."""
+    def draw(self, rng: np.random.Generator) -> np.ndarray:
+        """Return a pose (J, 3)."""
         component = int(rng.choice(len(self.weights), p=self.weights))
         spread = self.spreads[self.cells[component]]
         flat = self.means[component] + spread @ rng.standard_normal(spread.shape[1])
-        return np.ascontiguousarray(flat.reshape(3, -1).T), component
+        return np.ascontiguousarray(flat.reshape(3, -1).T)
 
 
 def _mixtures(prior: AnnotationPrior, images: np.ndarray) -> Iterator[list[_Mixture]]:

@@ -1,4 +1,4 @@
-"""Compiled Metropolis walk over a pose pair that is lifted from one annotation."""
+"""Compiled parallel tempering of a pose pair that is lifted from one annotation."""
 
 from __future__ import annotations
 
@@ -15,51 +15,86 @@ from probmotion.models.pose_pairs.pair_moves import SHIFT, TURN, Body, propose
 
 __all__ = ["walk_lift"]
 
-_COMPONENT_EVERY = 50
-"""Steps between draws of the component."""
+_STEPS = 50  # Metropolis steps of a replica between swaps
 _TARGET_ACCEPTANCE = 0.3
 
 
 @numba.njit(cache=True, nogil=True)
 def walk_lift(
-    pose: np.ndarray,
-    component: int,
+    poses: np.ndarray,
+    powers: np.ndarray,
     log_weights: np.ndarray,
     means: np.ndarray,
     cells: np.ndarray,
     roots: np.ndarray,
-    n_steps: int,
+    sweeps: int,
     moves: np.ndarray,
     log_sizes: np.ndarray,
     tune: bool,
     body: Body,
     physics: Physics,
     rng: np.random.Generator,
-) -> int:
-    """Sample pose X and component c from w_c N(X; m_c, C_c) times the physical prior.
+) -> None:
+    """Sample K replicas of pose X and component c by parallel tempering.
+
+    The density of replica k is w_c N(X; m_c, C_c) times the physical prior, with the density of
+    bone lengths to the power ``powers[k]``. After a sweep of 50 steps of each, neighbours are
+    swapped by a Metropolis step, even and odd ones in turn (Syed et al. 2022).
+
+    Updates in place: ``poses`` (K, J, 3) and, with ``tune``, ``log_sizes`` (K, 2, kinds) of moves
+    in all directions and in depth. ``log_weights`` (c,) are log w_c − ½ log det C_c; ``means``
+    (c, 3 J) contain all x, all y, all z; ``roots`` (C, 3 J, r) are matrices R with R Rᵀ = C⁻¹, of
+    which ``cells`` (c,) selects those of the components.
+    """
+    replicas = len(powers)
+    squares = np.empty(replicas)
+    for sweep in range(sweeps):
+        for k in range(replicas):
+            _walk(
+                poses[k], log_weights, means, cells, roots, powers[k], moves, log_sizes[k],
+                sweep * _STEPS if tune else -1, body, physics, rng,
+            )  # fmt: skip
+            squares[k] = log_lengths(poses[k], body)[1]
+        for k in range(sweep % 2, replicas - 1, 2):
+            change = (powers[k + 1] - powers[k]) * (squares[k + 1] - squares[k])
+            if -rng.standard_exponential() < 0.5 * change / body.bone_noise**2:
+                hotter = poses[k].copy()
+                poses[k], poses[k + 1] = poses[k + 1], hotter
+
+
+@numba.njit(cache=True, nogil=True)
+def _walk(
+    pose: np.ndarray,
+    log_weights: np.ndarray,
+    means: np.ndarray,
+    cells: np.ndarray,
+    roots: np.ndarray,
+    power: float,
+    moves: np.ndarray,
+    log_sizes: np.ndarray,
+    tuned: int,
+    body: Body,
+    physics: Physics,
+    rng: np.random.Generator,
+) -> None:
+    """Draw the component given ``pose``, then move ``pose`` by Metropolis steps.
 
     Half of the shifts and rotations are in depth, where a pose is less certain than in the image.
-    Returns c. Updates in place: ``pose`` (J, 3) and, with ``tune``, ``log_sizes`` (2, kinds) of
-    moves in all directions and in depth. ``log_weights`` (c,) are log w_c − ½ log det C_c;
-    ``means`` (c, 3 J) contain all x, all y, all z; ``roots`` (C, 3 J, r) are matrices R with
-    R Rᵀ = C⁻¹, of which ``cells`` (c,) selects those of the components.
+    ``tuned`` is the number of steps for which ``log_sizes`` were tuned; they are not if it is
+    negative.
     """
     people = len(body.roots)
     parts, new_parts = np.zeros(2 + 2 * people), np.empty(2 + 2 * people)
     proposed = np.empty_like(pose)
+    white, new_white = np.empty(roots.shape[2]), np.empty(roots.shape[2])
+    component = _draw_component(pose, log_weights, means, cells, roots, white, rng)
     root = roots[cells[component]]
-    white, new_white = np.empty(root.shape[1]), np.empty(root.shape[1])
     _whiten(pose, means[component], root, white)
-    parts[0] = -0.5 * (white @ white) + _log_bones(pose, body)
+    parts[0] = -0.5 * (white @ white) + _log_bones(pose, body, power)
     parts[1] = log_penetration(pose, physics)
     for person in range(people):
         write_limit_terms(pose, person, physics, parts)
-    for step in range(n_steps):
-        if step % _COMPONENT_EVERY == 0:
-            component = _draw_component(pose, log_weights, means, cells, roots, white, rng)
-            root = roots[cells[component]]
-            _whiten(pose, means[component], root, white)
-            parts[0] = -0.5 * (white @ white) + _log_bones(pose, body)
+    for step in range(_STEPS):
         number = int(rng.random() * len(moves))
         kind, joint = moves[number, 0], moves[number, 1]
         depth = int(rng.random() * 2)
@@ -69,7 +104,7 @@ def walk_lift(
         # Delayed acceptance: the Gaussian first (Christen and Fox 2005).
         new_white[:] = white
         _add_change(pose, proposed, root, new_white)
-        new_parts[0] = -0.5 * (new_white @ new_white) + _log_bones(proposed, body)
+        new_parts[0] = -0.5 * (new_white @ new_white) + _log_bones(proposed, body, power)
         accepted = -rng.standard_exponential() < new_parts[0] - parts[0]
         if accepted:
             if kind != TURN and kind != SHIFT:
@@ -81,20 +116,19 @@ def walk_lift(
             accepted = -rng.standard_exponential() < gain
         if accepted:
             pose[:], parts[:], white[:] = proposed, new_parts, new_white
-        if tune:
-            log_sizes[depth, kind] += (accepted - _TARGET_ACCEPTANCE) / np.sqrt(1.0 + step)
-    return component
+        if tuned >= 0:
+            log_sizes[depth, kind] += (accepted - _TARGET_ACCEPTANCE) / np.sqrt(1.0 + tuned + step)
 
 
 @numba.njit(cache=True, nogil=True)
-def _log_bones(pose: np.ndarray, body: Body) -> float:
+def _log_bones(pose: np.ndarray, body: Body, power: float) -> float:
     """Return the log density of the bone lengths, up to a constant.
 
     It is relative to the base measure of the moves, uniform directions and log lengths: a bone of
     length l has the volume element l³ d(log l) d(direction).
     """
     total, squares = log_lengths(pose, body)
-    return 3.0 * total - 0.5 * squares / body.bone_noise**2
+    return 3.0 * total - 0.5 * power * squares / body.bone_noise**2
 
 
 @numba.njit(cache=True, nogil=True)

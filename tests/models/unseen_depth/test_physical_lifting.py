@@ -12,8 +12,17 @@ from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.interaction.annotations.annotations import Annotations
 from probmotion.interaction.annotations.sources import draw_annotations
 from probmotion.models.pose_pairs import PosePairPrior, penetration_depth
-from probmotion.models.pose_pairs.pair_moves import SHIFT, SLIDE, SWING, TURN, propose
+from probmotion.models.pose_pairs.pair_moves import (
+    APPROACH,
+    SHIFT,
+    SLIDE,
+    SWING,
+    TURN,
+    moves_of,
+    propose,
+)
 from probmotion.models.unseen_depth import AnnotationPrior, physical_lifting as physical
+from probmotion.models.unseen_depth.keypoints import centred_images
 from probmotion.models.unseen_depth.physical_lifting import physical_lifts
 from probmotion.motion.skeleton import Skeleton
 from probmotion.threads import one_thread
@@ -87,8 +96,8 @@ def test_draws_match_importance_weighted_lifts(
     weights = np.exp(log_weights - log_weights.max())
     weights /= weights.sum()
     assert 1 / (weights**2).sum() > 1000
-    many = np.repeat(annotation, 200, axis=0)
-    draws = physical_lifts(prior, many, physics, warmup=5000, steps=1)[0]
+    many = np.repeat(annotation, 120, axis=0)
+    draws = physical_lifts(prior, many, physics, warmup=50, sweeps=1)[0]
     for values, of_exact in (
         (log_lengths(draws, pose), lengths),
         (draws[..., 2], exact[..., 2]),
@@ -148,17 +157,35 @@ def test_steps_in_depth_are_larger(prior, keypoints, pose, monkeypatch):
         return walk_lift(*arguments)
 
     monkeypatch.setattr(physical, "walk_lift", watched)
-    physical_lifts(prior, keypoints[:3], PosePairPrior(pose, SKELETON), steps=1)
-    everywhere, in_depth = np.exp(np.mean(kept, axis=0))
+    physical_lifts(prior, keypoints[:3], PosePairPrior(pose, SKELETON), sweeps=1)
+    everywhere, in_depth = np.exp(np.mean(kept, axis=(0, 1)))
     kinds = [SHIFT, TURN, SWING, SLIDE]
     assert (in_depth[kinds] > 1.2 * everywhere[kinds]).all()
 
 
+def test_swaps_have_the_densities_of_the_replicas(prior, keypoints, pose):
+    """Two poses whose bones keep their lengths are exchanged between powers 0.2 and 1."""
+    physics = PosePairPrior(pose, SKELETON)
+    [[mixture]] = physical._mixtures(prior, centred_images(keypoints[:1])[0])
+    given = mixture.log_weights, mixture.means, mixture.cells, mixture.roots
+    moves, rigid = moves_of(physics.body), np.full((2, 2, APPROACH), -60.0)
+    moves, powers = moves[moves[:, 0] != APPROACH], np.array([0.2, 1.0])
+    longer, rng = 1.02 * pose, np.random.default_rng(0)
+    poses, cold = np.stack([pose, longer]), []
+    for _ in range(1500):
+        physical.walk_lift(
+            poses, powers, *given, 2, moves, rigid, False, physics.body, physics.physics, rng
+        )
+        cold.append(abs(log_lengths(poses[1], pose)).max() < 1e-6)
+    energy = 0.5 * (log_lengths(longer, pose) ** 2).sum() / physics.body.bone_noise**2
+    assert np.mean(cold) == pytest.approx(1 / (1 + np.exp(-0.8 * energy)), abs=0.05)
+
+
 def test_draws_do_not_depend_on_other_annotations_or_threads(prior, keypoints, pose):
     physics = PosePairPrior(pose, SKELETON)
-    every = physical_lifts(prior, keypoints[:5], physics, warmup=50, steps=50, draws=2, seed=3)
+    every = physical_lifts(prior, keypoints[:5], physics, warmup=2, sweeps=2, draws=2, seed=3)
     with one_thread():
-        some = physical_lifts(prior, keypoints[:3], physics, warmup=50, steps=50, draws=2, seed=3)
+        some = physical_lifts(prior, keypoints[:3], physics, warmup=2, sweeps=2, draws=2, seed=3)
     np.testing.assert_allclose(some, every[:, :3], atol=1e-9)
     assert abs(some[1] - some[0]).max() > 0.01
 
