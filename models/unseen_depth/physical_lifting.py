@@ -42,7 +42,7 @@ from probmotion.validation import check_count
 
 __all__ = ["physical_lifts"]
 
-_POWERS = np.geomspace(0.15, 1.0, 6)  # of b(X); neighbours are swapped about half of the time
+_POWERS = np.geomspace(0.15, 1.0, 6)  # of b(X); four to five of ten swaps are accepted
 _INITIAL_SIZE = 0.03  # of the steps, radians, metres or log length
 _LEAST_VARIANCE = 1e-9  # relative; the variance of the mean depth is 0
 
@@ -123,10 +123,11 @@ def physical_lifts(
                 pose[:] = physics.joint_limits.nearest_valid(pose)
         log_sizes = np.full((len(_POWERS), 2, APPROACH), math.log(_INITIAL_SIZE))
         for number in range(-1, draws):
+            first = warmup + number * sweeps if number >= 0 else 0
             walk_lift(
                 poses, _POWERS, mixture.log_weights, mixture.means, mixture.cells, mixture.roots,
-                warmup if number < 0 else sweeps, moves, log_sizes, number < 0, physics.body,
-                physics.physics, rng,
+                first, warmup if number < 0 else sweeps, moves, log_sizes, number < 0,
+                physics.body, physics.physics, rng,
             )  # fmt: skip
             poses[..., 2] -= poses[..., 2].mean(axis=1, keepdims=True)
             if number >= 0:

@@ -27,6 +27,7 @@ def walk_lift(
     means: np.ndarray,
     cells: np.ndarray,
     roots: np.ndarray,
+    first: int,
     sweeps: int,
     moves: np.ndarray,
     log_sizes: np.ndarray,
@@ -39,7 +40,8 @@ def walk_lift(
 
     The density of replica k is w_c N(X; m_c, C_c) times the physical prior, with the density of
     bone lengths to the power ``powers[k]``. After a sweep of 50 steps of each, neighbours are
-    swapped by a Metropolis step, even and odd ones in turn (Syed et al. 2022).
+    swapped by a Metropolis step, even and odd ones in turn (Syed et al. 2022);
+    ``first`` is the number of earlier sweeps.
 
     Updates in place: ``poses`` (K, J, 3) and, with ``tune``, ``log_sizes`` (K, 2, kinds) of moves
     in all directions and in depth. ``log_weights`` (c,) are log w_c − ½ log det C_c; ``means``
@@ -48,7 +50,7 @@ def walk_lift(
     """
     replicas = len(powers)
     squares = np.empty(replicas)
-    for sweep in range(sweeps):
+    for sweep in range(first, first + sweeps):
         for k in range(replicas):
             _walk(
                 poses[k], log_weights, means, cells, roots, powers[k], moves, log_sizes[k],

@@ -32,7 +32,7 @@ _WINDOWS = 8192  # most windows of the tracks; fewer if there are fewer frames
 _BATCH = 256
 _SIMULATED = 8192  # codes whose keypoints are simulated
 _COMPONENTS, _WINDOWS_PER_COMPONENT = 32, 64
-_ROUNDS = 2  # codes of windows differ once the encoder is calibrated; a third changes little
+_ROUNDS = 2  # of calibration; a third hardly changes the speed of draws
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,8 +178,8 @@ def with_learnt_codes(
 ) -> MotionVAE:
     """Return the prior with the distribution of its training codes and a calibrated encoder.
 
-    The encoder is calibrated to the codes that it has of training windows, twice, since these
-    change with it; the mixture is that of the second time.
+    Twice, the encoder is calibrated on simulations from its own codes of training windows, which
+    change with it. The mixture is fitted to the codes of the second time.
 
     Parameters
     ----------
@@ -196,10 +196,11 @@ def with_learnt_codes(
     """
     model = prior.model
     for number in range(_ROUNDS):
+        run = Path(folder) / str(number)
         windows = EncodedWindows.of(trainee, model)
         encoder = EncoderTrainee(trainee, model, windows)
-        learn(encoder, settings, Path(folder) / str(number))
-        model = encoder.learnt(Path(folder) / str(number))
+        learn(encoder, settings, run)
+        model = encoder.learnt(run)
     mean, log_variance = windows.mean.double().numpy(), windows.log_variance.double().numpy()
     rng = seeds.generator(0, "codes")
     components = min(_COMPONENTS, max(1, len(mean) // _WINDOWS_PER_COMPONENT))

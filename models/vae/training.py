@@ -361,8 +361,8 @@ class MotionVAETrainee(_VAETrainee):
 def usual_motion_vae_training(size: str) -> tuple[TrainingSettings, ...]:
     """Return the training settings of three phases for a size: ``tiny``, ``small`` or ``paper``.
 
-    The third calibrates the encoder. The paper trains the others for 120 and 180 epochs; ``paper``
-    assumes 1000 steps per epoch.
+    The third, run twice, calibrates the encoder. The paper trains the others for 120 and 180
+    epochs; ``paper`` assumes 1000 steps per epoch.
     Raises ``ValueError`` for an unknown size.
     """
     tiny = TrainingSettings(steps=300, batch=16, learning_rate=5e-3, ema=0.97)

@@ -23,7 +23,7 @@ __all__ = ["TrainMotionVAE"]
 class TrainMotionVAE:
     """Train a pose network, then a motion VAE (prior over short 3D motions), on 2D tracks.
 
-    The codes of the tracks are then fitted by a mixture, and the encoder is calibrated.
+    The encoder is then calibrated twice, and a mixture is fitted to its codes of the tracks.
 
     Run the same command again to resume an interrupted run; increase --steps to extend
     the training of the VAE.

@@ -96,8 +96,9 @@ def test_draws_match_importance_weighted_lifts(
     weights = np.exp(log_weights - log_weights.max())
     weights /= weights.sum()
     assert 1 / (weights**2).sum() > 1000
+    monkeypatch.setattr(physical, "_POWERS", np.array([0.4, 1.0]))  # Two replicas are faster.
     many = np.repeat(annotation, 120, axis=0)
-    draws = physical_lifts(prior, many, physics, warmup=50, sweeps=1)[0]
+    draws = physical_lifts(prior, many, physics, warmup=60, sweeps=1)[0]
     for values, of_exact in (
         (log_lengths(draws, pose), lengths),
         (draws[..., 2], exact[..., 2]),
@@ -153,7 +154,7 @@ def test_steps_in_depth_are_larger(prior, keypoints, pose, monkeypatch):
     kept, walk_lift = [], physical.walk_lift
 
     def watched(*arguments):
-        kept.append(arguments[8])
+        kept.append(arguments[9])
         return walk_lift(*arguments)
 
     monkeypatch.setattr(physical, "walk_lift", watched)
@@ -174,7 +175,7 @@ def test_swaps_have_the_densities_of_the_replicas(prior, keypoints, pose):
     poses, cold = np.stack([pose, longer]), []
     for _ in range(1500):
         physical.walk_lift(
-            poses, powers, *given, 2, moves, rigid, False, physics.body, physics.physics, rng
+            poses, powers, *given, 0, 2, moves, rigid, False, physics.body, physics.physics, rng
         )
         cold.append(abs(log_lengths(poses[1], pose)).max() < 1e-6)
     energy = 0.5 * (log_lengths(longer, pose) ** 2).sum() / physics.body.bone_noise**2
