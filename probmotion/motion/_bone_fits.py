@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solveh_banded
 
 from probmotion.geometry.rotations import vector_to_matrix
 from probmotion.motion.kinematics import least_rotations
@@ -197,6 +196,8 @@ def _smoothed(right: np.ndarray, weights: np.ndarray, fps: float) -> np.ndarray:
     bands[1] = weights
     bands[1, 1:] += stiffness
     bands[1, :-1] += stiffness
+    from scipy.linalg import solveh_banded  # slow, and not needed by `--help`
+
     return solveh_banded(bands, right)
 
 
