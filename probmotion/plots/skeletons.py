@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "WIDEST", "checked_rows", "draw_ground", "draw_skeletons", "face_heading", "head_circles",
-    "head_joints", "joint_sides", "project_frames", "write_key",
+    "head_joints", "joint_sides", "project_frames", "vertical_range", "write_key",
 ]  # fmt: skip
 
 _HEAD = {"head", "head_top", "nose", "left_eye", "right_eye", "left_ear", "right_ear"}
@@ -144,7 +144,8 @@ def _compose(
 
     moments = next(iter(strips.values())).shape[1]
     columns = max(len(strip) for strip in strips.values())
-    slot, low, high = _extent(strips, truth)
+    slot = _slot_width(strips, truth)
+    low, high = vertical_range(next(iter(strips.values())), skeleton)
     # A letter of a row label is about 0.075 inches wide.
     label_width = 0.25 + 0.075 * max(map(len, strips))
     shape = (high - low) / (slot * moments)
@@ -179,21 +180,23 @@ def _anchor(motion: np.ndarray, truth: np.ndarray | None) -> np.ndarray:
     return np.median(body[..., 0], axis=-1)
 
 
-def _extent(
-    strips: Mapping[str, np.ndarray], truth: np.ndarray | None
-) -> tuple[float, float, float]:
-    """Return the width of a slot, and the vertical range of the first row, metres."""
+def _slot_width(strips: Mapping[str, np.ndarray], truth: np.ndarray | None) -> float:
+    """Return the width of a frame's slot, metres."""
     sideways = [
         np.quantile(
             [np.abs(motion[..., 0] - _anchor(motion, truth)[:, None]) for motion in row], 0.995
         )
         for row in strips.values()
     ]
-    reference = next(iter(strips.values()))
-    low, high = float(reference[..., 1].min()), float(reference[..., 1].max())
+    return 2.1 * float(min(max(sideways), WIDEST * sideways[0])) + 1e-9
+
+
+def vertical_range(motions: np.ndarray, skeleton: Skeleton) -> tuple[float, float]:
+    """Return the vertical range of motions (n, L, J, 2), with a margin and whole heads, metres."""
+    low, high = float(motions[..., 1].min()), float(motions[..., 1].max())
     margin = 0.08 * (high - low) + 1e-9
-    reach = min(max(sideways), WIDEST * sideways[0])
-    return 2.1 * float(reach) + 1e-9, low - margin, high + margin
+    tops = [head.get_extents().y1 for motion in motions for head in head_circles(motion, skeleton)]
+    return low - margin, max([high + margin, *tops])
 
 
 def _draw_strip(

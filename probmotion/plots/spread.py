@@ -18,6 +18,7 @@ from probmotion.plots.skeletons import (
     head_circles,
     head_joints,
     project_frames,
+    vertical_range,
     write_key,
 )
 from probmotion.plots.style import GREY, INK, PAGE, SIZE, SMALL, finish_figure, sampler_style
@@ -149,7 +150,9 @@ def _compose(
     first = next(iter(overlaid.values()))
     moments = first.shape[1]
     anchor = np.median(first if truth is None else truth[None], axis=(0, 2))[:, 0]
-    slot, low, high = _extent([*overlaid.values()], truth, anchor)
+    slot = _slot_width([*overlaid.values()], anchor)
+    shown = first if truth is None else np.append(first, truth[None], 0)
+    low, high = vertical_range(shown, skeleton)
     shape = (high - low) / (slot * moments)
     lines = -(-len(overlaid) // max(1, int(PAGE / (moments * _MIN_FRAME_WIDTH))))
     across = -(-len(overlaid) // lines)
@@ -199,15 +202,10 @@ def _compose(
     return figure
 
 
-def _extent(
-    rows: Sequence[np.ndarray], truth: np.ndarray | None, anchor: np.ndarray
-) -> tuple[float, float, float]:
-    """Return the width of a slot, and the vertical range of the first row and truth, metres."""
+def _slot_width(rows: Sequence[np.ndarray], anchor: np.ndarray) -> float:
+    """Return the width of a frame's slot, metres."""
     reach = [float(np.quantile(np.abs(row[..., 0] - anchor[:, None]), 0.998)) for row in rows]
-    heights = rows[0][..., 1] if truth is None else np.append(rows[0], truth[None], 0)[..., 1]
-    low, high = float(heights.min()), float(heights.max())
-    margin = 0.08 * (high - low) + 1e-9
-    return 2.1 * min(max(reach), WIDEST * reach[0]) + 1e-9, low - margin, high + margin
+    return 2.1 * min(max(reach), WIDEST * reach[0]) + 1e-9
 
 
 def _draw_panel(

@@ -6,10 +6,11 @@ import sys
 
 import numpy as np
 import pytest
-from matplotlib.collections import LineCollection
+from matplotlib.collections import LineCollection, PatchCollection
 from matplotlib.colors import to_hex
 
 from probmotion import Skeleton
+from probmotion.data.synthetic.animals import synthetic_animals
 from probmotion.data.synthetic.gaits import make_gait
 from probmotion.plots.skeletons import draw_skeletons, joint_sides
 from probmotion.plots.style import GREY, LEFT, RIGHT
@@ -57,6 +58,17 @@ def test_all_strips_have_the_same_scale():
     figure.draw_without_rendering()
     scales = [np.diag(axes.transData.get_matrix())[:2] for axes in figure.axes]
     np.testing.assert_allclose(scales, np.full((2, 2), scales[0][0]), rtol=1e-9)
+
+
+def test_heads_are_whole():
+    """An animal's head is above the rest of it, and larger than the margin."""
+    animal = synthetic_animals(1, seed=3)[0]
+    figure = draw_skeletons({"animal": animal.positions[None, :10]}, animal.skeleton)
+    for axes in figure.axes:
+        heads = [each for each in axes.collections if isinstance(each, PatchCollection)]
+        assert heads
+        top = max(path.get_extents().y1 for each in heads for path in each.get_paths())
+        assert top <= axes.get_ylim()[1]
 
 
 def test_truth_is_drawn_at_its_relative_position():
