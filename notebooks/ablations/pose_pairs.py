@@ -1,14 +1,13 @@
-"""Ablations of pose-pair sampling on CMU salsa: Yin et al. (2018), section 6, figures 6 to 11.
+"""Ablations of pose-pair sampling on CMU salsa: Yin et al. (2018), section 6, figures 6 to 9.
 
     python notebooks/ablations/pose_pairs.py --out pose-pairs
     python notebooks/ablations/pose_pairs.py --quick --out quick     (synthetic dances, minutes)
 
-``--parts`` selects noise, calibration, paired, truncation, velocity, converged, retrieval,
-coverage, embedding and completion; each writes a CSV file and figures to ``--out``. ``converged``
-and ``retrieval`` draw with ``tempered-pairs``, the others with ``mh`` from the seed, as in the
-paper. Draws are stored in ``--out/comparisons`` (3 GB in total); run the same command again to
-resume an interrupted study. The parts embedding and completion use the draws of the part coverage.
-The data are located by :func:`probmotion.data.downloads.salsa_pairs`.
+``--parts`` selects noise, calibration, paired, truncation, velocity, coverage and embedding; each
+writes a CSV file and figures to ``--out``. All draw with ``mh`` from the seed, as in the paper; such
+chains do not mix, those of ``mixed_pairs.py`` do. Draws are stored in ``--out/comparisons`` (3 GB in
+total); run the same command again to resume an interrupted study. The part embedding uses the draws
+of the part coverage. The data are located by :func:`probmotion.data.downloads.salsa_pairs`.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -36,21 +35,11 @@ from probmotion.data.pair_sets import (
 )
 from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.files import written_whole
-from probmotion.interaction.annotations.backbones import annotation_views
 from probmotion.interaction.annotations.sources import DrawnAnnotations, draw_annotations
-from probmotion.interaction.annotations.views import project_to_views
-from probmotion.interaction.completion import (
-    complete_keypoints,
-    nearest_annotation_completion,
-    occluded_joint_error,
-)
 from probmotion.interaction.geometry.coordinates import align_rigidly
 from probmotion.interaction.geometry.pose_distances import MEASURES, pose_distances
-from probmotion.interaction.retrieval import retrieve, views_around
 from probmotion.metrics.coverage import coverage
-from probmotion.models.pose_pairs import PosePairPrior
 from probmotion.models.pose_pairs.pair_posterior import PairSettings, pair_posterior
-from probmotion.models.pose_pairs.single_pose_lifting import lift_people
 from probmotion.motion.skeleton import Skeleton
 from probmotion.plots.calibration_curves import draw_calibration
 from probmotion.plots.coverage import classical_scaling, draw_coverage, draw_embedding
@@ -59,7 +48,7 @@ from probmotion.posteriors.draws import MotionDraws
 from probmotion.posteriors.problem import Problem
 from probmotion.posteriors.sampling import Sampler
 from probmotion.posteriors.truncation import TruncatedPosterior, limit_for_dimension
-from probmotion.samplers import MetropolisHastings, TemperedPairs
+from probmotion.samplers import MetropolisHastings
 from probmotion.samplers.mcmc.proposals import Isotropic, Proposal, VelocityBiased
 
 SEED = 0
@@ -199,28 +188,6 @@ class Study:
         }
         return self.run("coverage", problems, draws=self.draws)
 
-    @cached_property
-    def by_tempering(self) -> Runs:
-        """Draws of parallel tempering from densities without truncation.
-
-        Both coordinates have the same annotations and views. Of 5599 annotations, 855 are among the
-        nearest ones of 32 views, and 5596 among those of 2048.
-        """
-        variants: dict[str, dict[str, Any]] = {
-            f"{density} {size}": {"density": density, "noise": size}
-            for size in (0.005, 0.01)
-            for density in ("interaction", "cartesian")
-        }
-        variants["2048 views"] = {"density": "interaction", "noise": 0.01, "n_views": 2048}
-        problems = {
-            f"{name}, repeat {repeat}": settings | {"repeat": repeat, "limit": np.inf}
-            for repeat in range(self.repeats)
-            for name, settings in variants.items()
-        }
-        effort = {"warmup": 30, "thin": 2} if self.quick else {"warmup": 600, "thin": 10}
-        samplers = {"tempered-pairs": TemperedPairs(levels=24, steps=120, **effort)}
-        return self.compared("converged", problems, samplers, 400)
-
     def table(
         self, runs: Runs, fewer: Sequence[int] = (), also: Sequence[str] = ()
     ) -> pd.DataFrame:
@@ -287,6 +254,9 @@ class Study:
                 columns=4,
                 title=f"states 200, 400, 600 and 800 of a chain, by {compared}",
             )
+
+
+S = TypeVar("S", bound=Study)
 
 
 def step_by_step(draws: MotionDraws) -> np.ndarray:
@@ -372,102 +342,6 @@ def truncation(study: Study) -> pd.DataFrame:
     return study.table(study.run("truncation", problems), also=("at_cap", "near_floor"))
 
 
-def converged(study: Study) -> pd.DataFrame:
-    """Return coverage by draws of parallel tempering, of held-out and of annotated pairs."""
-    runs, rows = study.by_tempering, []
-    if (draws := runs.draws("interaction 0.01, repeat 0", "tempered-pairs")) is not None:
-        sets = {"real": evenly(study.held_out, 150), "posterior": evenly(step_by_step(draws), 200)}
-        embed(sets | {"seed": study.seed_pose[None]}, study.out / "figure8-converged.png")
-    for run in runs.comparison.results:
-        row = dict(runs.settings[run.problem])
-        draws = runs.draws(run.problem, run.sampler)
-        if draws is None:
-            rows.append(row | {"failed": str(run.failure)})
-            continue
-        if "n_views" in row:
-            row["density"] = f"{row['density']}, {row['n_views']} views"
-        annotated = evenly(study.drawn_annotations(row["repeat"]).positions, study.n_held_out)
-        poses = step_by_step(draws)
-        row |= {name: run.metrics[name] for name in ("rhat", "seconds")}
-        for measure in MEASURES:
-            for pairs, truth in (("held-out", study.held_out), ("annotated", annotated)):
-                value = float(coverage(truth, poses, measure))
-                rows.append({"measure": measure, "pairs": pairs, "coverage": value, **row})
-    return pd.DataFrame(rows)
-
-
-def retrieval(study: Study) -> pd.DataFrame:
-    """Return errors in 3D of pairs found for held-out annotations (figures 10 and 11), metres.
-
-    Lifted pairs have valid joint angles. Naive samples are a thousand of those around the lifted
-    pair. Of these, and of the draws of parallel tempering, the nearest to the annotation is found.
-    """
-    draws = study.by_tempering.draws("interaction 0.01, repeat 0", "tempered-pairs")
-    if draws is None:
-        raise RuntimeError("retrieval needs the draws of converged, which failed")
-    states, skeleton = step_by_step(draws), Skeleton.preset("pair17")
-    prior = study.posterior().prior
-    frames = [dance_frames(clip) for clip in study.clips[1]]
-    test = draw_annotations(study.clips[1], 8 if study.quick else 60, SEED, frames=frames)
-    views = annotation_views(test.annotations, study.seed_pose)
-    rows: list[dict[str, object]] = []
-    pictures: dict[str, list[np.ndarray]] = {}
-    every = np.ones(skeleton.n_joints, dtype=bool)
-    for index, (keypoints, view) in enumerate(zip(test.annotations.keypoints, views, strict=True)):
-        around = views_around(view)
-        lifted = lift_people(keypoints, every, study.seed_pose, skeleton, view)
-        naive = samples_around(lifted, prior, seeds.generator(SEED, "naive", index))
-        found = {"lifting": lifted}
-        for name, poses in (("naive", naive), ("draws", states)):
-            nearest = retrieve(keypoints, poses, skeleton, views=around)
-            found[name] = poses[int(nearest.indices[0])]
-        truth = test.positions[index]
-        pictures.setdefault("annotation", []).append(keypoints)
-        side = view + np.array([np.pi / 2, 0.0])
-        for name, pose in {"truth": truth, **found}.items():
-            pictures.setdefault(f"{name},\nfrom the side", []).append(seen_from(side, pose))
-        for name, pose in found.items():
-            error = np.linalg.norm(align_rigidly(pose, truth) - truth, axis=-1).mean()
-            rows.append({"method": name, "pair": index, "error": error})
-    images_of = {label: np.stack(images) for label, images in pictures.items()}
-    draw_pairs(images_of, skeleton, study.out / "figure10.png", columns=4)
-    draw_nearest(study, evenly(states, 4)[:4])
-    return pd.DataFrame(rows)
-
-
-def seen_from(view: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Return a pair (J, 3) with x to the right, y up and no depth in a view (2,), for pictures."""
-    image = project_to_views(pose[None], view[None], Skeleton.preset("pair17"))[0, 0]
-    return np.pad(image, ((0, 0), (0, 1)))
-
-
-def samples_around(
-    lifted: np.ndarray, prior: PosePairPrior, rng: np.random.Generator
-) -> np.ndarray:
-    """Return the most plausible 1000 of 4000 pairs around a lifted one, with its bone lengths."""
-    theta = np.repeat(prior.coordinates(lifted)[None], 4000, axis=0)
-    spread = np.full(prior.dim, 0.1)  # radians and metres
-    spread[6 * len(prior.skeleton.roots) + 2 :: 3] = 0.0
-    poses = prior.motion(theta + spread * rng.standard_normal(theta.shape))
-    order = np.argsort(-prior.log_plausibility(poses), kind="stable")
-    return poses[order[:1000], 0]
-
-
-def draw_nearest(study: Study, poses: np.ndarray) -> None:
-    """Plot pairs in the views in which annotations are nearest, with these (figure 11)."""
-    skeleton = Skeleton.preset("pair17")
-    annotated = study.drawn_annotations(0).annotations
-    pairs, near = [], []
-    for pose in poses:
-        found = retrieve(annotated.keypoints, pose[None], skeleton)
-        nearest = np.argsort(found.distances[:, 0], kind="stable")[:3]
-        pairs.append(seen_from(found.views[nearest[0], 0], pose))
-        near.append(annotated.keypoints[nearest])
-    labels = ("nearest\nannotation", "second", "third")
-    rows = {"draw": np.array(pairs), **dict(zip(labels, np.swapaxes(near, 0, 1), strict=True))}
-    draw_pairs(rows, skeleton, study.out / "figure11.png", columns=4)
-
-
 def velocity(study: Study) -> pd.DataFrame:
     """Return coverage by proposal at equal acceptance and number of draws (figure 7)."""
     proposals = {
@@ -543,73 +417,20 @@ def embed(
     return pd.DataFrame({"kind": kinds, "x": points[:, 0], "y": points[:, 1]})
 
 
-def completion(study: Study) -> pd.DataFrame:
-    """Return image-plane errors of occluded joints of held-out pairs by method, metres.
-
-    All methods use the same estimate of the view, from the torsos.
-    """
-    frames = [dance_frames(clip) for clip in study.clips[1]]
-    n = 10 if study.quick else 60
-    test = draw_annotations(study.clips[1], n, SEED, frames=frames, hidden=0.3)
-    complete = draw_annotations(study.clips[1], n, SEED, frames=frames)
-    annotated = study.drawn_annotations(0).annotations
-    skeleton = annotated.skeleton
-    views = annotation_views(test.annotations, study.seed_pose)
-    draws = study.by_density.draws("interaction, repeat 0")
-    states = None if draws is None else evenly(step_by_step(draws), 10_000)
-    rows = []
-    for index in range(n):
-        keypoints, visible = test.annotations.keypoints[index], test.annotations.visible[index]
-        truth = complete.annotations.keypoints[index]
-        view = views[index]
-        if np.isnan(view).any():  # too few torso joints are visible
-            continue
-        lifted = lift_people(keypoints, visible, study.seed_pose, skeleton, view)
-        seed = project_to_views(study.seed_pose[None], view[None], skeleton)[0, 0]
-        completed = {
-            "nearest annotation": nearest_annotation_completion(
-                keypoints, visible, annotated.keypoints, skeleton
-            ).positions,
-            "single-pose lifting": lifted[:, :2],
-            "the seed": np.asarray(align_rigidly(seed, keypoints, visible)),
-        }
-        if states is not None:
-            completed["draws"] = complete_keypoints(
-                keypoints, visible, states, skeleton, views=views_around(view)
-            ).positions
-        for name, positions in completed.items():
-            error = occluded_joint_error(truth, positions, ~visible)
-            rows.append({"method": name, "pair": index, "error": error})
-    return pd.DataFrame(rows)
-
-
 PARTS: dict[str, Callable[[Study], pd.DataFrame]] = {
     "noise": noise,
     "calibration": calibration,
     "paired": paired,
     "truncation": truncation,
     "velocity": velocity,
-    "converged": converged,
-    "retrieval": retrieval,
     "coverage": densities,
     "embedding": embedding,
-    "completion": completion,
 }
 
 
 def shown(name: str, table: pd.DataFrame) -> pd.DataFrame:
-    """Return the printed table of a part: means over chains and pairs."""
+    """Return the printed table of a part: means over chains."""
     keys = [k for k in ("density", "proposal", "noise", "limit", "draws") if k in table]
-    if name in ("completion", "retrieval"):
-        return table.groupby("method")["error"].agg(["mean", "median", "sem"]).round(4)
-    if name == "converged":
-        settings = ["measure", "pairs", "noise"]
-        wide = table.pivot_table("coverage", [*settings, "repeat"], "density")
-        for other in wide.columns.drop("interaction"):
-            wide[f"{other}, difference"] = wide[other] - wide["interaction"]
-        means = wide.groupby(level=settings).agg(["mean", "sem"])
-        means.columns = [" ".join(names).removesuffix(" mean") for names in means.columns]
-        return means.round(4)
     if "measure" not in table:
         return table if name == "calibration" else table.groupby("kind").size().to_frame("poses")
     columns = [
@@ -622,11 +443,16 @@ def shown(name: str, table: pd.DataFrame) -> pd.DataFrame:
     return wide.round(4)
 
 
-def main() -> None:
-    """Run the selected parts and print every table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def main(
+    description: str,
+    kind: type[S],
+    parts: Mapping[str, Callable[[S], pd.DataFrame]],
+    shown: Callable[[str, pd.DataFrame], pd.DataFrame],
+) -> None:
+    """Run the selected parts of a kind of study and print every table as ``shown`` returns it."""
+    parser = argparse.ArgumentParser(description=description.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("pose-pairs"), help="Output folder.")
-    names = list(PARTS)
+    names = list(parts)
     parser.add_argument("--parts", nargs="*", choices=names, default=names, help="Parts to run.")
     parser.add_argument("--quick", action="store_true", help="Synthetic dances and few draws.")
     parser.add_argument("--draws", type=int, help="Draws of all chains; default: 100000.")
@@ -637,7 +463,7 @@ def main() -> None:
     if options.repeats < 1 or given < 400 or given % 40:
         parser.error("--repeats must be at least 1, --draws a multiple of 40 and at least 400")
     options.out.mkdir(parents=True, exist_ok=True)
-    study = Study(
+    study = kind(
         options.out,
         options.quick,
         draws=options.draws or (4000 if options.quick else 100_000),
@@ -649,11 +475,11 @@ def main() -> None:
     )
     for name in options.parts:
         start = time.perf_counter()
-        table = PARTS[name](study)
+        table = parts[name](study)
         with written_whole(options.out / f"{name}.csv") as unfinished:
             table.to_csv(unfinished, index=False)
         print(f"\n{name} ({time.perf_counter() - start:.0f} s)\n{shown(name, table).to_string()}")
 
 
 if __name__ == "__main__":
-    main()
+    main(__doc__, Study, PARTS, shown)

@@ -1,4 +1,4 @@
-"""Page of lifted pairs: the motion, the keypoints beside it, and a command to start from a frame.
+"""Page of lifted pairs: the motion, keypoints, a map of frames, and a command to start from one.
 
 It is self-contained.
 """
@@ -15,19 +15,25 @@ import numpy as np
 
 from probmotion.comparison.results.stored_problems import StoredProblem
 from probmotion.geometry.cameras import Cameras
+from probmotion.interaction.geometry.pose_distances import pose_distances
 from probmotion.motion.motion import Motion
 from probmotion.plots.animation import animated_page, animation_html
+from probmotion.plots.coverage import classical_scaling
 from probmotion.plots.motion_data import Shown
 
 __all__ = ["pair_page"]
 
 _DRAWS = 3  # shown beside the mean
 _FRAMES = 900  # most frames of the animation
+_DOTS = 200  # most frames of the map
 _STYLE = """
 body { margin: 0 auto; max-width: 75rem; padding: 1rem; }
 h1 { font-size: 1.4rem; } h2 { font-size: 1.1rem; margin: .8rem 0 .3rem; }
 .sides { display: grid; gap: 1rem; grid-template-columns: repeat(auto-fit, minmax(20rem, 1fr)); }
 .picture canvas { display: block; width: 100%; aspect-ratio: 4 / 3; border: 1px solid var(--rule); }
+.map { display: block; width: 100%; border: 1px solid var(--rule); cursor: pointer; }
+.map circle { stroke: none; r: 2; }
+.map .shown { stroke: var(--ink); stroke-width: 1.5; r: 4; }
 .picture pre { overflow-x: auto; background: var(--raised); padding: .5rem; font-size: .85rem; }
 """
 _START = """\
@@ -108,6 +114,10 @@ def pair_page(
 <div class="picture">
 <h2>Keypoints</h2>
 <canvas role="img" aria-label="Keypoints of the frame">This picture requires JavaScript.</canvas>
+<h2>Map of frames</h2>
+{_map(motion.positions, step)}
+<p class="quiet">Similar pairs are close to each other; click to show one. Blue: early frames;
+orange: late ones.</p>
 <h2>Sample pose-pairs around this frame</h2>
 <pre><code></code></pre>
 <button type="button" data-does="copy">Copy</button>
@@ -116,9 +126,29 @@ def pair_page(
 </div>"""
     functions = {
         ".picture": _text("probmotion.plots", "picture.js"),
+        ".map": _text("probmotion.plots", "map.js"),
         "[data-does=copy]": _text("probmotion.report", "copy.js"),
     }
     return animated_page(title, body, _STYLE, functions)
+
+
+def _map(positions: np.ndarray, step: int) -> str:
+    """Return frames, embedded by interaction distance (Yin et al. 2018, figure 5), as SVG."""
+    frames = np.arange(len(positions[::step]))
+    frames = frames[:: -(-len(frames) // _DOTS)]
+    poses = positions[frames * step]
+    points = classical_scaling(pose_distances(poses, poses, "interaction"))
+    points -= 0.5 * (points.min(axis=0) + points.max(axis=0))
+    points *= np.min([190, 140] / np.maximum(np.ptp(points, axis=0), 1e-9))
+    dots = [
+        f'<circle data-frame="{frame}" cx="{x:.1f}" cy="{y:.1f}" style="fill: color-mix(in oklab, '
+        f'var(--uncertain) {100 * frame / max(frames[-1], 1):.0f}%, var(--certain))"/>'
+        for frame, (x, y) in zip(frames, points, strict=True)
+    ]
+    return (
+        '<svg class="map" viewBox="-100 -75 200 150" role="img" aria-label="Map of frames">'
+        f"{''.join(dots)}</svg>"
+    )
 
 
 def _text(package: str, name: str) -> str:

@@ -132,6 +132,17 @@ def test_the_page_shows_each_frame_and_a_command_that_runs(folder, lifted, tmp_p
         browser.value(go.format(0))
         browser.wait_until(f"!{code}.includes('[{frame}]')")
         assert browser.value(picture) != seen
+        # A click near the dot of another frame shows this frame.
+        dots = [int(number) for number in re.findall(r'<circle data-frame="(\d+)"', text)]
+        other = dots[len(dots) // 2]
+        click = "(() => {{ const dot = document.querySelector('[data-frame=\"{}\"]');"
+        click += "const {{ left, top }} = dot.getBoundingClientRect();"
+        click += "dot.dispatchEvent(new MouseEvent('click', {{ clientX: left, clientY: top,"
+        click += "bubbles: true }})); }})()"
+        browser.value(click.format(other))
+        browser.wait_until(f"{code}.includes('{other}')")
+        lit = "document.querySelector('.map .shown').dataset.frame"
+        browser.wait_until(f"{lit} === '{other}'")
         assert browser.errors() == []
     (data,) = re.findall(r'json">({"fps".*?)</script>', text)
     sd = np.frombuffer(base64.b64decode(json.loads(data)["sds"][0]), "<i2").reshape(-1, 34)
