@@ -11,13 +11,15 @@ command again to resume an interrupted study. Options and data are those of ``po
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
 from pose_pairs import SEED, Runs, Study, embed, evenly, main, step_by_step
 
 from probmotion import seeds
@@ -39,16 +41,27 @@ from probmotion.models.pose_pairs.single_pose_lifting import lift_people
 from probmotion.motion.skeleton import Skeleton
 from probmotion.plots.coverage import classical_scaling
 from probmotion.plots.pairs import draw_pairs
-from probmotion.plots.style import GREY, LEFT, RIGHT, finish_figure, paper_panels
+from probmotion.plots.style import GREY, LEFT, PAGE, RIGHT, finish_figure
 from probmotion.samplers import TemperedPairs
 
 
 class MixedStudy(Study):
     """Study whose chains mix."""
 
+    def mixed(self, variants: Mapping[str, Mapping[str, Any]], repeats: int) -> Runs:
+        """Return draws of parallel tempering from densities without truncation."""
+        problems = {
+            f"{name}, repeat {repeat}": {**settings, "repeat": repeat, "limit": np.inf}
+            for repeat in range(repeats)
+            for name, settings in variants.items()
+        }
+        effort = {"warmup": 30, "thin": 2} if self.quick else {"warmup": 600, "thin": 10}
+        samplers = {"tempered-pairs": TemperedPairs(levels=24, steps=120, **effort)}
+        return self.compared("mixed", problems, samplers, 400)
+
     @cached_property
-    def by_tempering(self) -> Runs:
-        """Draws of parallel tempering from densities without truncation.
+    def by_density(self) -> Runs:
+        """Draws from the densities that are compared.
 
         Both coordinates have the same annotations and views. Of 5599 annotations, 855 are among the
         nearest ones of 32 views, and 5596 among those of 2048.
@@ -59,19 +72,13 @@ class MixedStudy(Study):
             for density in ("interaction", "cartesian")
         }
         variants["2048 views"] = {"density": "interaction", "noise": 0.01, "n_views": 2048}
-        problems = {
-            f"{name}, repeat {repeat}": settings | {"repeat": repeat, "limit": np.inf}
-            for repeat in range(self.repeats)
-            for name, settings in variants.items()
-        }
-        effort = {"warmup": 30, "thin": 2} if self.quick else {"warmup": 600, "thin": 10}
-        samplers = {"tempered-pairs": TemperedPairs(levels=24, steps=120, **effort)}
-        return self.compared("converged", problems, samplers, 400)
+        return self.mixed(variants, self.repeats)
 
     @cached_property
     def states(self) -> np.ndarray:
         """Draws in interaction coordinates at the published σ_l, (400, J, 3)."""
-        draws = self.by_tempering.draws("interaction 0.01, repeat 0", "tempered-pairs")
+        published = {"interaction 0.01": {"density": "interaction", "noise": 0.01}}
+        draws = self.mixed(published, 1).draws("interaction 0.01, repeat 0", "tempered-pairs")
         if draws is None:
             raise RuntimeError("the draws of interaction coordinates failed; see the message above")
         return step_by_step(draws)
@@ -91,18 +98,17 @@ def annotations(study: MixedStudy) -> pd.DataFrame:
 
 def draw_map(points: np.ndarray, keypoints: np.ndarray, path: Path) -> None:
     """Plot embedded annotations (n, J, 2), with pictures of those that are far from each other."""
-    from matplotlib.collections import LineCollection
-
-    figure, (axes,) = paper_panels(1, 5.0, across=1)
+    width, height = np.ptp(points, axis=0)
+    figure = Figure(figsize=(PAGE, PAGE * (height + 0.15 * width) / (1.15 * width)))
+    axes = figure.add_axes((0, 0, 1, 1))
     axes.scatter(*points.T, s=5.0, c=GREY)
-    reach = np.ptp(points, axis=0).max()
     chosen = [0]
-    for _ in range(17):
+    for _ in range(24):
         away = np.linalg.norm(points[:, None] - points[chosen], axis=-1).min(axis=1)
-        if away.max() > 0.1 * reach:
+        if away.max() > 0.09 * width:
             chosen.append(int(away.argmax()))
     skeleton = Skeleton.preset("pair17")
-    size = 0.09 * reach / np.ptp(keypoints[chosen, :, 1], axis=1).mean()
+    size = 0.09 * width / np.ptp(keypoints[chosen, :, 1], axis=1).mean()
     for index in chosen:
         pose = points[index] + size * (keypoints[index] - keypoints[index].mean(axis=0))
         for root, colour in zip(skeleton.roots, (LEFT, RIGHT), strict=True):
@@ -112,13 +118,13 @@ def draw_map(points: np.ndarray, keypoints: np.ndarray, path: Path) -> None:
             axes.add_collection(LineCollection(bones, colors=colour, linewidths=0.9))
     axes.set_aspect("equal")
     axes.margins(0.08)
-    axes.set(xticks=[], yticks=[])
+    axes.set_axis_off()
     finish_figure(figure, path)
 
 
 def converged(study: MixedStudy) -> pd.DataFrame:
     """Return coverage by draws of parallel tempering, of held-out and of annotated pairs."""
-    runs, rows = study.by_tempering, []
+    runs, rows = study.by_density, []
     sets = {"real": evenly(study.held_out, 150), "posterior": evenly(study.states, 200)}
     embed(sets | {"seed": study.seed_pose[None]}, study.out / "figure8.png")
     for run in runs.comparison.results:
