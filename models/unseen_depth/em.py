@@ -71,16 +71,15 @@ def expectation(cells: ViewCells, keypoints: np.ndarray, unknown_scale: bool) ->
     # Relative to each annotation's own uncertainty: an ambiguous azimuth does not hide an axis.
     concentration = abs(axes.sum()) / max(abs(axes).sum(), 1e-12)
     first, second = cells.in_canonical_frame(sums, squares)
-    K = cells.component.max() + 1
-    members = (cells.component == np.arange(K)[:, None]).astype(float)
+    K = len(first)
     # The position is unknown: poses are about the mean of their joints.
     first = first - first.mean(axis=1, keepdims=True)
     second = second - second.mean(axis=1, keepdims=True)
     second = second - second.mean(axis=3, keepdims=True)
     return Moments(
-        members @ counts,
-        np.einsum("kc,cji->kji", members, first),
-        (members @ second.reshape(C, -1)).reshape(K, 3 * J, 3 * J),
+        counts.reshape(K, -1).sum(axis=1),
+        first,
+        second.reshape(K, 3 * J, 3 * J),
         depths,
         scales,
         float(concentration),

@@ -97,6 +97,8 @@ class ViewCells:
         self.component = np.repeat(np.arange(K), V)
         self.views = np.tile(views, (K, 1))
         self.axes = world_axes(self.views)
+        # In the order (3, 3) of axes, (J, J) of joints, the turn of a covariance is a product.
+        self._turns = np.einsum("cai,cbl->cabil", self.axes, self.axes).reshape(K, 9 * V, 9)
         self.means = np.einsum("cai,cji->caj", self.axes, means[self.component])
         self.means = self.means.reshape(K * V, 3 * J)
         self.covariances = self._in_camera(covariances.reshape(K, J, 3, J, 3))
@@ -113,11 +115,12 @@ class ViewCells:
 
     def _in_camera(self, covariances: np.ndarray) -> np.ndarray:
         """Return covariances in camera axes, (C, 3J, 3J)."""
-        first = np.einsum("cai,cjikl->cajkl", self.axes, covariances[self.component])
-        both = np.einsum("cajkl,cbl->cajbk", first, self.axes)
+        C, J = len(self.axes), self.n_joints
+        by_axes = covariances.transpose(0, 2, 4, 1, 3).reshape(-1, 9, J * J)
+        both = (self._turns @ by_axes).reshape(C, 3, 3, J, J).transpose(0, 1, 3, 2, 4)
         both[:, 2] -= both[:, 2].mean(axis=1, keepdims=True)
         both[:, :, :, 2] -= both[:, :, :, 2].mean(axis=3, keepdims=True)
-        return both.reshape(len(self.axes), 3 * self.n_joints, 3 * self.n_joints)
+        return both.reshape(C, 3 * J, 3 * J)
 
     def evidence(
         self, images: np.ndarray, visible: np.ndarray, unknown_scale: bool
@@ -215,11 +218,16 @@ class ViewCells:
         return variances[None]
 
     def in_canonical_frame(self, sums: np.ndarray, squares: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Rotate sums (C, 3J) and second moments (C, 3J, 3J) back: (C, J, 3), (C, J, 3, J, 3)."""
-        C, J = len(self.means), self.n_joints
-        first = np.einsum("cai,caj->cji", self.axes, sums.reshape(C, 3, J))
-        half = np.einsum("cai,cajbk->cjibk", self.axes, squares.reshape(C, 3, J, 3, J))
-        return first, np.einsum("cjibk,cbl->cjikl", half, self.axes)
+        """Rotate sums (C, 3J) and second moments (C, 3J, 3J) back, and add those of a component.
+
+        The results are (K, J, 3) and (K, J, 3, J, 3).
+        """
+        K, J = len(self._turns), self.n_joints
+        axes = self.axes.reshape(K, -1, 3)  # rows (V, 3)
+        first = np.swapaxes(sums.reshape(K, -1, J), 1, 2) @ axes
+        by_axes = squares.reshape(-1, 3, J, 3, J).transpose(0, 1, 3, 2, 4).reshape(K, -1, J * J)
+        second = np.swapaxes(self._turns, 1, 2) @ by_axes
+        return first, second.reshape(K, 3, 3, J, J).transpose(0, 3, 1, 4, 2)
 
 
 def likely_scales(pose: np.ndarray, images: np.ndarray, visible: np.ndarray) -> np.ndarray:
