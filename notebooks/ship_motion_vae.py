@@ -144,7 +144,7 @@ def trained(kind: Kind, tracks: dict[str, list[KeypointTrack]], folder: Path) ->
     train(first, poses, folder / "poses")
     second = MotionVAETrainee(*given, first.learnt(folder / "poses"), distance=Filming().distance)
     train(second, replace(vae, steps=kind.steps), folder / "vae")
-    prior = MotionVAE.load(folder / "vae")
+    prior = MotionVAE.load(folder / "vae", codes=None)
     return with_learnt_codes(second, prior, encoder, folder / "encoder")
 
 
@@ -245,6 +245,7 @@ dimensions; λ_KL = {size.kl:g}; {weights:.1f} MB.
   projected from random sides at a distance of {network["distance"]:g} m and mirrored with probability 1/2.
   Training clips: {clip_list(network["data"]["clips"])}.
   Validation clips: {clip_list(network["validation_data"]["clips"])}.
+  Test clips: {clip_list([clip.name for clip in clips["test"]])}.
 - **Provenance**: {kind.provenance}
 - **Not for**: other skeletons or frame rates; motions unlike the training clips. The rigid pose is
   not part of the latent code: draws stay at one position and face forward.

@@ -97,7 +97,7 @@ class ViewCells:
         self.component = np.repeat(np.arange(K), V)
         self.views = np.tile(views, (K, 1))
         self.axes = world_axes(self.views)
-        # In the order (3, 3) of axes, (J, J) of joints, the turn of a covariance is a product.
+        # Rotating a covariance is one matrix product if its axes are ordered (3, 3, J, J).
         self._turns = np.einsum("cai,cbl->cabil", self.axes, self.axes).reshape(K, 9 * V, 9)
         self.means = np.einsum("cai,cji->caj", self.axes, means[self.component])
         self.means = self.means.reshape(K * V, 3 * J)

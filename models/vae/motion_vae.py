@@ -8,6 +8,7 @@ frame) is not part of the code but a separate parameter.
 from __future__ import annotations
 
 import copy
+import warnings
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
@@ -123,8 +124,8 @@ class MotionVAE(CodePrior):
         """Load a trained prior from a checkpoint file, a run folder or a shipped name.
 
         ``options`` are ``rigid``, ``log_lengths``, ``inference_network`` and ``codes`` of
-        :class:`MotionVAE`. Files without a mixture of codes, such as those of a run of the second
-        phase, have N(0, I).
+        :class:`MotionVAE`. Files without a mixture of codes, such as those of earlier versions and
+        of a run of the second phase, have N(0, I), with a warning unless ``codes`` is given.
         Raises ``CheckpointError`` for a damaged file or another kind of network, and
         ``FileNotFoundError`` for a missing one.
         """
@@ -143,6 +144,12 @@ class MotionVAE(CodePrior):
             with valid_settings(source, KIND):
                 stored = CodeMixture(*(values.double().numpy() for values in parts))
             options = {"codes": stored} | options
+        elif "codes" not in options:
+            warnings.warn(
+                f"{source} has no mixture of codes, so that draws come from N(0, I) and are slow; "
+                "learn it again with probmotion train motion-vae, or pass codes=None",
+                stacklevel=2,
+            )
         card = checkpoint.settings
         return cls(model.vae, model.pose, settings, body, fps, card=card, **options)
 

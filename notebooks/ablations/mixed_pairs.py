@@ -1,12 +1,12 @@
-"""Pose-pair densities compared by chains that have mixed: Yin et al. (2018), figures 5 and 8 to 12.
+"""Pose-pair densities compared by chains that have mixed: Yin et al. (2018), figures 5, 8, 10 to 12.
 
     python notebooks/ablations/mixed_pairs.py --out mixed-pairs
     python notebooks/ablations/mixed_pairs.py --quick --out quick     (synthetic dances, minutes)
 
 ``--parts`` selects annotations, converged, retrieval and completion; each writes a CSV file and
 figures to ``--out``. Draws are of ``tempered-pairs``, stored in ``--out/comparisons``: run the same
-command again to resume an interrupted study. Options and data are those of ``pose_pairs.py``;
-``--draws`` has no effect, since all densities have 400 draws.
+command again to resume an interrupted study. Options and data are those of ``pose_pairs.py``, but
+all densities have 400 draws, and ``--repeats`` is of the part converged alone.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class MixedStudy(Study):
         return self.compared("mixed", problems, samplers, 400)
 
     @cached_property
-    def by_density(self) -> Runs:
+    def by_tempering(self) -> Runs:
         """Draws from the densities that are compared.
 
         Both coordinates have the same annotations and views. Of 5599 annotations, 855 are among the
@@ -105,8 +105,9 @@ def draw_map(points: np.ndarray, keypoints: np.ndarray, path: Path) -> None:
     chosen = [0]
     for _ in range(24):
         away = np.linalg.norm(points[:, None] - points[chosen], axis=-1).min(axis=1)
-        if away.max() > 0.09 * width:
-            chosen.append(int(away.argmax()))
+        if away.max() < 0.09 * width:
+            break
+        chosen.append(int(away.argmax()))
     skeleton = Skeleton.preset("pair17")
     size = 0.09 * width / np.ptp(keypoints[chosen, :, 1], axis=1).mean()
     for index in chosen:
@@ -124,9 +125,10 @@ def draw_map(points: np.ndarray, keypoints: np.ndarray, path: Path) -> None:
 
 def converged(study: MixedStudy) -> pd.DataFrame:
     """Return coverage by draws of parallel tempering, of held-out and of annotated pairs."""
-    runs, rows = study.by_density, []
-    sets = {"real": evenly(study.held_out, 150), "posterior": evenly(study.states, 200)}
-    embed(sets | {"seed": study.seed_pose[None]}, study.out / "figure8.png")
+    runs, rows = study.by_tempering, []
+    if (draws := runs.draws("interaction 0.01, repeat 0", "tempered-pairs")) is not None:
+        sets = {"real": evenly(study.held_out, 150), "posterior": evenly(step_by_step(draws), 200)}
+        embed(sets | {"seed": study.seed_pose[None]}, study.out / "figure8.png")
     for run in runs.comparison.results:
         row = dict(runs.settings[run.problem])
         draws = runs.draws(run.problem, run.sampler)
@@ -217,7 +219,7 @@ def draw_nearest(study: Study, poses: np.ndarray) -> None:
 def completion(study: MixedStudy) -> pd.DataFrame:
     """Return image-plane errors of occluded joints of held-out pairs by method, metres (figure 12).
 
-    All methods use the same estimate of the view, from the torsos.
+    All methods but the nearest annotation use the same estimate of the view, from the torsos.
     """
     frames = [dance_frames(clip) for clip in study.clips[1]]
     n = 10 if study.quick else 60
@@ -275,7 +277,10 @@ def shown(name: str, table: pd.DataFrame) -> pd.DataFrame:
     if name == "annotations":
         return table.describe().round(4)
     if name in ("completion", "retrieval"):
-        return table.groupby("method")["error"].agg(["mean", "median", "sem"]).round(4)
+        errors = table.pivot(index="pair", columns="method", values="error")
+        above = errors.sub(errors["draws"], axis=0).agg(["mean", "sem"]).T
+        parts = errors.agg(["count", "mean", "median", "sem"]).T, above.add_prefix("above draws, ")
+        return pd.concat(parts, axis=1).round(4)
     settings = ["measure", "pairs", "noise"]
     wide = table.pivot_table("coverage", [*settings, "repeat"], "density")
     for other in wide.columns.drop("interaction"):
@@ -286,4 +291,4 @@ def shown(name: str, table: pd.DataFrame) -> pd.DataFrame:
 
 
 if __name__ == "__main__":
-    main(__doc__, MixedStudy, PARTS, shown)
+    main(__doc__, MixedStudy, PARTS, shown, "mixed-pairs")

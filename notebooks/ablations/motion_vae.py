@@ -142,7 +142,7 @@ class Study:
         trainee = self._trainee(MotionVAETrainee, self.size(changes), self.poses(changes))
         folder = self.out / "networks" / name
         self._train(trainee, 1, folder)
-        return MotionVAE.load(folder)
+        return MotionVAE.load(folder, codes=None)
 
     def _trainee(self, kind: Any, size: MotionVAESettings, *more: Any) -> Any:
         # Use training tracks if all validation tracks are too short; no setting depends on them.

@@ -179,7 +179,7 @@ class Study:
 
     @cached_property
     def by_density(self) -> Runs:
-        """Draws of the part "coverage" from four densities, also used by other parts."""
+        """Draws of the part "coverage" from four densities, and of "embedding"."""
         problems = {
             f"{density}, repeat {repeat}": {"density": density, "repeat": repeat}
             for density in ("interaction", "cartesian", "prior", "shape-context")
@@ -448,10 +448,14 @@ def main(
     kind: type[S],
     parts: Mapping[str, Callable[[S], pd.DataFrame]],
     shown: Callable[[str, pd.DataFrame], pd.DataFrame],
+    folder: str,
 ) -> None:
-    """Run the selected parts of a kind of study and print every table as ``shown`` returns it."""
+    """Run the selected parts of a kind of study and print every table as ``shown`` returns it.
+
+    ``folder`` is the default of ``--out``.
+    """
     parser = argparse.ArgumentParser(description=description.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("pose-pairs"), help="Output folder.")
+    parser.add_argument("--out", type=Path, default=Path(folder), help="Output folder.")
     names = list(parts)
     parser.add_argument("--parts", nargs="*", choices=names, default=names, help="Parts to run.")
     parser.add_argument("--quick", action="store_true", help="Synthetic dances and few draws.")
@@ -482,4 +486,4 @@ def main(
 
 
 if __name__ == "__main__":
-    main(__doc__, Study, PARTS, shown)
+    main(__doc__, Study, PARTS, shown, "pose-pairs")

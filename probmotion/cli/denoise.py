@@ -46,7 +46,7 @@ class Denoise(Conventions):
     """Student-t noise with 3 degrees of freedom, for recordings with outliers."""
 
     correct: FlagCreatePairsOff[bool] = False
-    """Correct mean and draws with networks (.1 s per frame, needs torch)."""
+    """Correct mean and draws with networks (.1 to .2 s per frame, needs torch)."""
 
     draws: int = 20
     """Number of posterior draws."""

@@ -104,7 +104,7 @@ class TrainMotionVAE:
         run_training(trainee, vae, self.out / "vae", device)
         prior = with_learnt_codes(
             trainee,
-            MotionVAE.load(self.out / "vae"),
+            MotionVAE.load(self.out / "vae", codes=None),
             encoder,
             self.out / "encoder",
             learn=partial(run_training, device=device),

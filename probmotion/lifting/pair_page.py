@@ -33,7 +33,7 @@ h1 { font-size: 1.4rem; } h2 { font-size: 1.1rem; margin: .8rem 0 .3rem; }
 .picture canvas { display: block; width: 100%; aspect-ratio: 4 / 3; border: 1px solid var(--rule); }
 .map { display: block; width: 100%; border: 1px solid var(--rule); cursor: pointer; }
 .map circle { stroke: none; r: 2; }
-.map .shown { stroke: var(--ink); stroke-width: 1.5; r: 4; }
+.map .shown { stroke: var(--uncertain); stroke-width: 2; r: 4; }
 .picture pre { overflow-x: auto; background: var(--raised); padding: .5rem; font-size: .85rem; }
 """
 _START = """\
@@ -116,8 +116,8 @@ def pair_page(
 <canvas role="img" aria-label="Keypoints of the frame">This picture requires JavaScript.</canvas>
 <h2>Map of frames</h2>
 {_map(motion.positions, step)}
-<p class="quiet">Similar pairs are close to each other; click to show one. Blue: early frames;
-orange: late ones.</p>
+<p class="quiet">Similar pairs are close to each other. Click to show one, or use the slider of the
+animation. Pale: early frames; dark: late ones.</p>
 <h2>Sample pose-pairs around this frame</h2>
 <pre><code></code></pre>
 <button type="button" data-does="copy">Copy</button>
@@ -142,11 +142,12 @@ def _map(positions: np.ndarray, step: int) -> str:
     points *= np.min([190, 140] / np.maximum(np.ptp(points, axis=0), 1e-9))
     dots = [
         f'<circle data-frame="{frame}" cx="{x:.1f}" cy="{y:.1f}" style="fill: color-mix(in oklab, '
-        f'var(--uncertain) {100 * frame / max(frames[-1], 1):.0f}%, var(--certain))"/>'
+        f'var(--ink) {100 * frame / max(frames[-1], 1):.0f}%, var(--rule))"/>'
         for frame, (x, y) in zip(frames, points, strict=True)
     ]
     return (
-        '<svg class="map" viewBox="-100 -75 200 150" role="img" aria-label="Map of frames">'
+        '<svg class="map" viewBox="-100 -75 200 150" role="img" '
+        'aria-label="Map of frames; the slider shows the same frames">'
         f"{''.join(dots)}</svg>"
     )
 

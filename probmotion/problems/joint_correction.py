@@ -69,8 +69,8 @@ def correct_joints(
         Frames per second of the recording. At another rate than the networks', corrections are
         interpolated.
     iterations : int
-        Number of optimisation steps of the Motion-DVAE, about .1 s per frame for 50; 0 leaves it
-        out.
+        Number of optimisation steps of the Motion-DVAE, about .1 to .2 s per frame for 50; 0
+        leaves it out.
     corrector : JointCorrector, optional
         First network, by default ``joint-corrector``.
     prior : MotionDVAE, optional

@@ -16,6 +16,7 @@ from probmotion.data.synthetic.gaits import make_gait
 from probmotion.interaction.annotations import Annotations
 from probmotion.io.files import load
 from probmotion.lifting import LiftedPairs, lift_pairs
+from probmotion.lifting.pair_page import _map
 from probmotion.models.unseen_depth import AnnotationPrior
 from probmotion.models.unseen_depth.view_cells import OneDirectionError
 from probmotion.motion.motion import KeypointTrack, Motion
@@ -140,7 +141,7 @@ def test_the_page_shows_each_frame_and_a_command_that_runs(folder, lifted, tmp_p
         click += "dot.dispatchEvent(new MouseEvent('click', {{ clientX: left, clientY: top,"
         click += "bubbles: true }})); }})()"
         browser.value(click.format(other))
-        browser.wait_until(f"{code}.includes('{other}')")
+        browser.wait_until(f"document.querySelector('input[type=range]').value === '{other}'")
         lit = "document.querySelector('.map .shown').dataset.frame"
         browser.wait_until(f"{lit} === '{other}'")
         assert browser.errors() == []
@@ -156,6 +157,19 @@ def test_the_page_shows_each_frame_and_a_command_that_runs(folder, lifted, tmp_p
     )
     draws = scope["draws"].flat()
     assert np.linalg.norm(draws[0, 0] - lifted.mean.positions[frame], axis=-1).mean() < 0.2
+
+
+def test_the_map_has_similar_pairs_close_to_each_other():
+    """Every second frame of two kinds of pairs is shown; in the others, pairs are reflected."""
+    poses = np.repeat(DANCE.positions[[0, 150]], 10, axis=0)
+    poses += 0.01 * np.random.default_rng(0).normal(size=poses.shape)
+    poses[1::2] *= [-1.0, 1.0, 1.0]
+    dots = re.findall(r'frame="(\d+)" cx="([^"]+)" cy="([^"]+)"', _map(poses, 2))
+    frames, points = [int(dot[0]) for dot in dots], np.array([dot[1:] for dot in dots], float)
+    assert frames == list(range(10))
+    assert (np.abs(points) <= [95.1, 70.1]).all()
+    apart = np.linalg.norm(points[:, None] - points, axis=-1)
+    assert max(apart[:5, :5].max(), apart[5:, 5:].max()) < 0.5 * apart[:5, 5:].min()
 
 
 def test_the_command_of_a_relative_page_has_absolute_paths(lifted, tmp_path, monkeypatch):

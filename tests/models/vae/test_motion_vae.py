@@ -128,11 +128,14 @@ def test_codes_follow_the_mixture():
         build(codes=CodeMixture.standard(2))
 
 
-def test_checkpoints_without_a_mixture_have_the_standard_normal(prior, tmp_path):
+def test_checkpoints_without_a_mixture_have_the_standard_normal_and_say_so(prior, tmp_path):
     path = tmp_path / "model.safetensors"
     save_checkpoint(path, Checkpoint(KIND, prior.card, prior.model.state_dict()))
     expected = -0.5 * (codes() ** 2 + math.log(2 * math.pi)).sum(axis=1)
-    np.testing.assert_allclose(MotionVAE.load(path).log_density(codes()), expected)
+    with pytest.warns(UserWarning, match=r"no mixture of codes.*probmotion train motion-vae"):
+        loaded = MotionVAE.load(path)
+    np.testing.assert_allclose(loaded.log_density(codes()), expected)
+    np.testing.assert_allclose(MotionVAE.load(path, codes=None).log_density(codes()), expected)
 
 
 class FixedPoses(torch.nn.Module):
