@@ -58,7 +58,9 @@ def _alarm(seconds: float) -> Iterator[None]:
             raise _Alarm
 
     before = signal.signal(signal.SIGALRM, interrupt)
-    remaining, interval = signal.setitimer(signal.ITIMER_REAL, seconds)
+    # Python ignores an exception that is raised in a destructor or in a callback of the garbage
+    # collector: the alarm repeats. Clean-up has as long as the block had.
+    remaining, interval = signal.setitimer(signal.ITIMER_REAL, seconds, seconds)
     start = time.monotonic()
     try:
         yield

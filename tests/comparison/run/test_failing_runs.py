@@ -6,6 +6,7 @@ import ast
 import pickle
 import re
 import signal
+import sys
 import threading
 import time
 from dataclasses import dataclass, fields
@@ -175,6 +176,22 @@ def test_a_time_limit_resumes_the_timer_of_the_caller():
         left, _ = signal.setitimer(signal.ITIMER_REAL, 0)
     assert 80 < left < 99.95
     assert signal.getsignal(signal.SIGALRM) is handler
+
+
+def test_a_time_limit_is_not_lost_in_a_destructor(monkeypatch):
+    # Python reports exceptions of destructors and goes on.
+    class Slow:
+        def __del__(self):
+            time.sleep(0.2)
+
+    reported = []
+    monkeypatch.setattr(sys, "unraisablehook", reported.append)
+    start = time.monotonic()
+    with pytest.raises(TimeLimitExceeded), time_limit(0.1):
+        Slow()
+        time.sleep(20)
+    assert len(reported) == 1
+    assert time.monotonic() - start < 10
 
 
 def test_a_time_limit_that_a_library_wraps_is_recognised():
