@@ -63,37 +63,50 @@ def folder(tmp_path_factory):
     return path
 
 
-def test_a_video_and_a_seed_become_pairs(capsys, folder, tmp_path):
-    words = ["pairs", str(folder / "two.json"), "--fps", "30", "--draws", "3"]
-    people = [str(folder / f"person{number}.npz") for number in range(2)]
-    bvh = str(folder / "seed.bvh")
-    for name, seed in (("one", [bvh]), ("two", people), ("swapped", [bvh, "--swap-people"])):
-        assert main([*words, "--seed", *seed, "--out", str(tmp_path / name)]) == 0
-        assert "from 52 of its 310 frames" in capsys.readouterr().out
-        assert sorted(path.name for path in (tmp_path / name).iterdir()) == NAMES
-    one, two, swapped = (
-        load(tmp_path / name / "pairs.npz").positions for name in ("one", "two", "swapped")
-    )
-    np.testing.assert_allclose(one, two, atol=1e-4)  # a BVH file is rounded
-    assert np.abs(swapped[:, 17:, 0] - one[:, :17, 0]).mean() < 0.05
-    assert load(tmp_path / "one" / "pairs.npz").name == "two"
+def run(source, *options, seed, out):
+    """Run the command on keypoints."""
+    words = ["--fps", "30", "--draws", "3", "--seed", *map(str, seed), "--out", str(out)]
+    assert main(["pairs", str(source), *options, *words]) == 0
 
 
-def test_people_are_chosen_and_landmarks_need_the_size_of_the_image(fails, folder, tmp_path):
-    words = ["--fps", "30", "--draws", "2", "--seed", str(folder / "seed.bvh"), "--out"]
-    media = ["media.json", "--people", "2"]
+@pytest.fixture(scope="module")
+def lifted(folder, tmp_path_factory):
+    """Return the two dancers, lifted, and the folder of the files."""
+    out = tmp_path_factory.mktemp("lifted") / "one"
+    run(folder / "two.json", seed=[folder / "seed.bvh"], out=out)
+    return load(out / "pairs.npz"), out
+
+
+def test_a_video_and_a_seed_become_pairs(capsys, folder, lifted, tmp_path):
+    motion, out = lifted
+    people = [folder / f"person{number}.npz" for number in range(2)]
+    run(folder / "two.json", seed=people, out=tmp_path / "two")
+    assert "from 52 of its 310 frames" in capsys.readouterr().out
+    run(folder / "two.json", "--swap-people", seed=[folder / "seed.bvh"], out=tmp_path / "swapped")
+    for path in (out, tmp_path / "two", tmp_path / "swapped"):
+        assert sorted(file.name for file in path.iterdir()) == NAMES
+    two, swapped = (load(tmp_path / name / "pairs.npz").positions for name in ("two", "swapped"))
+    np.testing.assert_allclose(motion.positions, two, atol=1e-4)  # a BVH file is rounded
+    assert np.abs(swapped[:, 17:, 0] - motion.positions[:, :17, 0]).mean() < 0.05
+    assert motion.name == "two"
+
+
+def test_people_are_chosen_and_landmarks_need_the_size_of_the_image(
+    fails, folder, lifted, tmp_path
+):
+    two, seed, media = lifted[0].positions, [folder / "seed.bvh"], ["media.json", "--people", "2"]
     cases = {
-        "two": ["two.json"],
         "three": ["three.json", "--persons", "1", "0", "--swap-people"],
         # People without ids are numbered from the left.
         "media": [*media, "--image-size", "2000", "1000", "--swap-people"],
     }
     for name, (file, *options) in cases.items():
-        assert main(["pairs", str(folder / file), *options, *words, str(tmp_path / name)]) == 0
-    two, three, landmarks = (load(tmp_path / name / "pairs.npz").positions for name in cases)
+        run(folder / file, *options, seed=seed, out=tmp_path / name)
+    three, landmarks = (load(tmp_path / name / "pairs.npz").positions for name in cases)
     np.testing.assert_array_equal(three, two)
     assert np.abs(landmarks - two).mean() < 0.02
-    assert "--image-size" in fails("pairs", folder / media[0], *media[1:], *words, tmp_path / "out")
+    words = ["--fps", "30", "--seed", *seed, "--out", tmp_path / "out"]
+    assert "--image-size" in fails("pairs", folder / media[0], *media[1:], *words)
 
 
 def test_errors_are_one_line_and_leave_no_files(fails, folder, tmp_path):
