@@ -82,7 +82,7 @@ def denoiser_rate(training: list[Motion]) -> float:
 
 def lift_rate() -> float:
     """Return the number of annotations of pairs that are lifted per second."""
-    from accuracy import dances
+    from annotation_figures import dances
 
     pairs = dances()
     prior, _ = pairs.fitted(pairs.annotated(500))
