@@ -89,7 +89,7 @@ def test_draws_match_importance_weighted_lifts(
         bone_noise=bone_noise,
         position_noise=position_noise,
     )
-    exact = prior.sample_lifts(annotation, np.random.default_rng(0), 60_000)[:, 0]
+    exact = prior.sample_lifts(annotation, np.random.default_rng(0), 20_000)[:, 0]
     lengths = log_lengths(exact, pose)
     log_weights = physics.log_plausibility(exact[:, None])
     log_weights = log_weights - 0.5 * (lengths / bone_noise) ** 2 @ np.ones(lengths.shape[1])
