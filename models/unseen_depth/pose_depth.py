@@ -7,7 +7,8 @@ than usual is inclined: the input contains the difference of its ends' depths fo
 length, without sign.
 
 An image and its mirror image, in which left and right are exchanged, have the same depths. The
-estimate is therefore the mean of both.
+estimate is therefore the mean of both. The network was trained on videos and their mirror images:
+where its two estimates differ, postures are unlike those on which it was trained.
 """
 
 from __future__ import annotations
@@ -71,12 +72,14 @@ class DepthEstimate(NamedTuple):
     """Depths of joints behind the middle of the hips along the ray to the body, and its pitch.
 
     The ray is that to the middle of the body in the image. ``depth`` and its standard deviation
-    ``spread`` are (L, J), metres. ``pitch`` is the angle of the ray above the horizon,
-    ``pitch_spread`` its standard deviation, (L,), radians.
+    ``spread`` are (L, J), metres, as is ``disagreement``, the distance from ``depth`` of the
+    estimates from the image alone and from the mirror image alone. ``pitch`` is the angle of the
+    ray above the horizon, ``pitch_spread`` its standard deviation, (L,), radians.
     """
 
     depth: np.ndarray
     spread: np.ndarray
+    disagreement: np.ndarray
     pitch: np.ndarray
     pitch_spread: np.ndarray
 
@@ -167,11 +170,14 @@ class PoseDepth:
         straight = self._outputs(network_inputs(frames[rows]))
         mirrored = self._outputs(network_inputs(_exchanged(frames)[rows]))
         order = [*_MIRRORED, J]
-        mean = (straight[:, : J + 1] + mirrored[:, order]) / 2
+        first, second = straight[:, : J + 1], mirrored[:, order]
+        mean, disagreement = (first + second) / 2, np.abs(first - second) / 2
         logs = (straight[:, J + 1 :] + mirrored[:, J + 1 :][:, order]) / 2
         # Errors have about a Laplace distribution.
         spread = np.sqrt(2.0) * np.exp(logs)
-        return DepthEstimate(mean[:, :J], spread[:, :J], mean[:, J], spread[:, J])
+        return DepthEstimate(
+            mean[:, :J], spread[:, :J], disagreement[:, :J], mean[:, J], spread[:, J]
+        )
 
     def _outputs(self, inputs: np.ndarray) -> np.ndarray:
         """Return the outputs of the last layer: ``(n, inputs) → (n, 2 (J + 1))``."""

@@ -240,11 +240,12 @@ def lift_views(
             bar.update,
         )
     evidence = [
-        Evidence(each, fps, camera, level, mean, windows, mirrored)
+        Evidence(each, fps, camera, level, mean, mirrored)
         for each, camera in zip(keypoints, recording.cameras.views, strict=True)
     ]
     chains *= size
-    return LiftedViews(size * mean, chains, level, keypoints, _worst(evidence))
+    proportions = float(np.median([window.proportions for window in windows]))
+    return LiftedViews(size * mean, chains, level, keypoints, _worst(evidence, proportions))
 
 
 def _noise(recording: _Recording, starts: Sequence[int], noise: float) -> tuple[float, float]:
@@ -304,13 +305,13 @@ def _size(recording: _Recording, apparent: float, starts: Sequence[int], noise: 
     return size
 
 
-def _worst(evidence: Sequence[Evidence]) -> tuple[Check, ...]:
+def _worst(evidence: Sequence[Evidence], proportions: float) -> tuple[Check, ...]:
     """Return some checks, each of the view with the largest value, with limits for V views.
 
-    How usual the motion is does not matter if several views determine it. V views may have √V times
-    the noise of one. Of three or more views, one that contradicts the others is left with large
-    residuals, while joints of detectors and of the prior differ by less; two views would meet
-    halfway.
+    How usual postures are does not matter if several views determine them, but ``proportions`` do,
+    the mean square of standardised bone lengths. V views may have √V times the noise of one. Of
+    three or more views, one that contradicts the others is left with large residuals, while joints
+    of detectors and of the prior differ by less; two views would meet halfway.
     """
     views = len(evidence)
     worst = {
@@ -328,10 +329,10 @@ def _worst(evidence: Sequence[Evidence]) -> tuple[Check, ...]:
         limit=_CONTRADICTIONS[views > 2],
         problem="keypoints of a view contradict the others (calibration, synchronisation, person?)",
     )
-    proportions = Check(
+    body = Check(
         "proportions",
-        float(np.median([window.proportions for window in evidence[0].windows])),
+        proportions,
         _PROPORTIONS,
         "the body has unusual proportions (another animal, swapped joints?)",
     )
-    return noise, residual, proportions, replace(worst["mirrored"], limit=0.0)
+    return noise, residual, body, replace(worst["mirrored"], limit=0.0)

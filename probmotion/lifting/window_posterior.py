@@ -90,15 +90,9 @@ class WindowGaussian:
 
 
 class WindowSummary(NamedTuple):
-    """Floor and usualness of the most probable mode of a window.
-
-    ``floor`` is its height, metres. ``posture``, ``surprise`` and ``proportions`` are mean squares
-    of standardised coefficients of the mean posture, of the motion and of bone lengths.
-    """
+    """Height of the floor, metres, and the mean square of standardised bone lengths."""
 
     floor: float
-    posture: float
-    surprise: float
     proportions: float
 
 
@@ -127,13 +121,10 @@ class WindowPosterior:
 
     @property
     def summary(self) -> WindowSummary:
-        """Floor and usualness of the most probable mode."""
+        """Floor and proportions of the most probable mode."""
         best, bones = self.best, len(self.prior.children)
         return WindowSummary(
-            float(self.origin[1] + self.floor(best)),
-            best.posture,
-            float(best.scale * (best.mean[:-bones] ** 2).mean()),
-            float((best.mean[-bones:] ** 2).mean()),
+            float(self.origin[1] + self.floor(best)), float((best.mean[-bones:] ** 2).mean())
         )
 
     def floor(self, mode: WindowMode) -> float:

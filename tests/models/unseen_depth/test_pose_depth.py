@@ -65,8 +65,27 @@ def test_mirrored_pictures_have_the_same_depths(network, rng):
     )
     assert np.allclose(other.depth, first.depth[:, MIRRORED])
     assert np.allclose(other.spread, first.spread[:, MIRRORED])
+    assert np.allclose(other.disagreement, first.disagreement[:, MIRRORED])
     assert np.allclose(other.pitch, first.pitch)
     assert np.abs(first.depth - first.depth[:, MIRRORED]).max() > 0.01
+
+
+def test_estimates_that_do_not_depend_on_the_image_agree(network, rng):
+    """The last layer's offsets are the estimates; those of a left joint alone have two values."""
+    (matrix, offset), *rest = network.layers[::-1]
+    offset = np.zeros_like(offset)
+    arguments = keypoints(rng)
+
+    def disagreement(offset):
+        layers = [*rest[::-1], (0 * matrix, offset)]
+        return replace(network, layers=layers).estimate(*arguments, RATE).disagreement
+
+    assert not disagreement(offset).any()
+    joint = next(j for j in range(J) if MIRRORED[j] != j)
+    offset[joint] = 0.3
+    found = disagreement(offset)
+    assert np.allclose(found[:, [joint, MIRRORED[joint]]], 0.15)
+    assert np.allclose(np.delete(found, [joint, MIRRORED[joint]], axis=1), 0)
 
 
 def test_place_and_size_in_the_picture_and_unknown_points_do_not_matter(network, rng):
