@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -9,9 +10,10 @@ import numpy as np
 
 from probmotion.lifting.camera import LevelCamera
 from probmotion.lifting.keypoints import LIMBS, PERSON, PersonKeypoints, averaged
+from probmotion.lifting.window_posterior import WindowSummary
 from probmotion.models.unseen_depth.pose_depth import DepthEstimate
 
-__all__ = ["MEDIAN", "Check", "Evidence", "checked", "checked_depths"]
+__all__ = ["MEDIAN", "Check", "Evidence", "checked", "checked_motion"]
 
 MEDIAN = 1.66
 """Median of squared residuals of a keypoint under Student-t noise with 4 degrees of freedom."""
@@ -75,7 +77,7 @@ _LIMITS = {
         "the motion is more likely with left and right exchanged (is the video mirrored?)",
     ),
 }
-_AMBIGUOUS = 0.0117  # metres
+_SURPRISE, _AMBIGUOUS = 1.75, 0.0117  # the latter in metres
 
 
 def checked(evidence: Evidence) -> tuple[Check, ...]:
@@ -109,18 +111,30 @@ def checked(evidence: Evidence) -> tuple[Check, ...]:
     )
 
 
-def checked_depths(depths: DepthEstimate, keypoints: PersonKeypoints) -> Check:
-    """Return the check of one camera's estimated depths.
+def checked_motion(
+    windows: Sequence[WindowSummary], depths: DepthEstimate, keypoints: PersonKeypoints
+) -> tuple[Check, Check]:
+    """Return the checks of a motion that one camera alone does not determine.
 
-    ``depths``: median over visible joints of how much an image and its mirror image disagree,
-    metres. It is large for animals, random keypoints and people who crawl or roll.
+    ``surprise``: mean square of standardised coefficients of the motion, median over windows.
+    ``depths``: median over visible joints of how much an image and its mirror image disagree on
+    depths, metres. It is large for animals, random keypoints and people who crawl or roll.
     """
     shown = keypoints.weight[:, LIMBS] > 0
-    return Check(
-        "depths",
-        float(np.median(depths.disagreement[shown])),
-        _AMBIGUOUS,
-        "postures are unlike those from which depths were learnt (another animal, swapped joints?)",
+    return (
+        Check(
+            "surprise",
+            float(np.median([window.surprise for window in windows])),
+            _SURPRISE,
+            "the motion is unlike those from which the prior was learnt",
+        ),
+        Check(
+            "depths",
+            float(np.median(depths.disagreement[shown])),
+            _AMBIGUOUS,
+            "postures are unlike those from which depths were learnt (another animal, swapped "
+            "joints?)",
+        ),
     )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from probmotion import seeds
 from probmotion.geometry.rotations import vector_to_matrix
 from probmotion.lifting.camera import LevelCamera
-from probmotion.lifting.checks import MEDIAN, Check, Evidence, checked, checked_depths
+from probmotion.lifting.checks import MEDIAN, Check, Evidence, checked, checked_motion
 from probmotion.lifting.keypoints import (
     LIMBS,
     PERSON,
@@ -128,10 +128,10 @@ def lift_track(
     floor = float(np.median([summary.floor for summary in summaries]))
     mirrored = other.score - estimate.score
     evidence = Evidence(keypoints, fps, found, level, mean, mirrored)
-    checks = (*checked(evidence), checked_depths(windows.depths, windows.keypoints))
+    unusual = checked_motion(summaries, windows.depths, windows.keypoints)
     if pitch is None:
         _tilt(chains, seed)
-    return TrackLift(mean, chains, floor, found, level, checks)
+    return TrackLift(mean, chains, floor, found, level, (*checked(evidence), *unusual))
 
 
 def _windows(keypoints: PersonKeypoints, fps: float) -> _Windows:

@@ -90,9 +90,14 @@ class WindowGaussian:
 
 
 class WindowSummary(NamedTuple):
-    """Height of the floor, metres, and the mean square of standardised bone lengths."""
+    """Floor and usualness of the most probable mode of a window.
+
+    ``floor`` is its height, metres. ``surprise`` and ``proportions`` are mean squares of
+    standardised coefficients of the motion and of bone lengths.
+    """
 
     floor: float
+    surprise: float
     proportions: float
 
 
@@ -121,10 +126,12 @@ class WindowPosterior:
 
     @property
     def summary(self) -> WindowSummary:
-        """Floor and proportions of the most probable mode."""
+        """Floor and usualness of the most probable mode."""
         best, bones = self.best, len(self.prior.children)
         return WindowSummary(
-            float(self.origin[1] + self.floor(best)), float((best.mean[-bones:] ** 2).mean())
+            float(self.origin[1] + self.floor(best)),
+            float(best.scale * (best.mean[:-bones] ** 2).mean()),
+            float((best.mean[-bones:] ** 2).mean()),
         )
 
     def floor(self, mode: WindowMode) -> float:
