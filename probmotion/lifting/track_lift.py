@@ -63,7 +63,9 @@ class _Windows(NamedTuple):
         spread = np.where(shown, _DEPENDENT * self.depths.spread[rows], np.inf)
         rays = camera.points(middle, np.ones(len(middle))) - camera.position
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        depths = EstimatedDepths(self.depths.depth[rows], spread, rays)
+        differences = self.depths.disagreement[rows][shown]
+        disagreement = float(np.median(differences)) if differences.size else 0.0
+        depths = EstimatedDepths(self.depths.depth[rows], spread, rays, disagreement)
         observed = Observed(seen, weight, noise, depths)
         return lift_window(self.prior, camera, observed, middle, depth, candidates=candidates)
 

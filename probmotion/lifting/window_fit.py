@@ -47,18 +47,22 @@ _FACTORS = (0.72, 0.85, 1.0, 1.18, 1.39)  # of the first estimate of the distanc
 _NEAR = 2  # headings of one component that are this close are one candidate
 _WIDE = 3.0  # factor of the noise in the first round
 _SMALL = 1e-4  # probability of modes that are left out
+_INFLATION = (1.7, 2.0)  # of standard deviations, with one camera and with several
+_AGREED = 0.006  # largest disagreement on depths that does not widen intervals, metres
 
 
 class EstimatedDepths(NamedTuple):
     """Depths of the joints of arms and legs behind the middle of the hips, as a regression says.
 
     ``values`` and the standard deviations ``sd`` of their errors, infinite where unknown, are
-    (L, 12), metres. ``rays`` are the directions of depth, unit vectors (L, 3).
+    (L, 12), metres. ``rays`` are the directions of depth, unit vectors (L, 3). ``disagreement`` is
+    that of an image and its mirror image, metres.
     """
 
     values: np.ndarray
     sd: np.ndarray
     rays: np.ndarray
+    disagreement: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,9 +281,22 @@ def _refined(
     assert best is not None
     mean_posture = np.flatnonzero((unit.part.frequency == 0) & ~unit.part.ground)
     posture = float(scales[0] * (best.mean[mean_posture] ** 2).mean())
+    disagreement = 0.0 if seen.depths is None else seen.depths.disagreement
+    inflation = _inflation(seen.points.ndim > 3, posture, disagreement)
     return WindowMode(
-        best.score, k, yaw, scales[0], best.mean, best.lower, at, standardised, posture
+        best.score, k, yaw, scales[0], best.mean, best.lower, at, standardised, inflation
     )
+
+
+def _inflation(several: bool, posture: float, disagreement: float) -> float:
+    """Return the factor of the posterior's standard deviations.
+
+    Motion unlike the clips makes them too small: where the mean square ``posture`` of the mean
+    posture's standardised coefficients is above 1, and where the regression of depths disagrees
+    with itself. Factors and powers were chosen on clips that prior and regression had not seen.
+    """
+    unusual = max(1.0, disagreement / _AGREED) ** 1.5
+    return _INFLATION[several] * max(1.0, posture) ** 0.5 * unusual
 
 
 class _Linear(NamedTuple):

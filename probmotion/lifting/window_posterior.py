@@ -20,11 +20,8 @@ FLOOR_SPREAD = 0.3
 TEMPER = 0.03
 """Power of the modes' probabilities.
 
-Chosen on validation clips, as is the factor of standard deviations, since motion unlike the clips
-makes the exact posterior too narrow. The factor is multiplied by the root of a mode's ``posture``
-if that is above 1.
+Chosen on validation clips, as motion unlike the clips makes the exact posterior too narrow.
 """
-_INFLATION = (1.7, 2.0)  # with one camera and with several
 _JOIN_NOISE = 0.01  # standard deviation with which draws continue earlier ones, metres
 
 
@@ -36,8 +33,7 @@ class WindowMode:
     the mean and the Cholesky factor of the precision of standardised coefficients: those of the
     component, then the floor's height, then the proportions. ``positions``, (L, J, 3), are those of
     the mean, metres, and ``standardised``, (L, J) or (V, L, J), squared residuals in units of the
-    noise. ``posture`` is the mean square of the standardised coefficients of frequency 0: of the
-    mean posture.
+    noise. ``inflation`` is the factor by which draws have larger standard deviations.
     """
 
     score: float
@@ -48,13 +44,7 @@ class WindowMode:
     lower: np.ndarray
     positions: np.ndarray
     standardised: np.ndarray
-    posture: float
-
-    @property
-    def inflation(self) -> float:
-        """Factor of the posterior's standard deviations."""
-        several = self.standardised.ndim > 2
-        return _INFLATION[several] * max(1.0, self.posture) ** 0.5
+    inflation: float
 
 
 class WindowGaussian:

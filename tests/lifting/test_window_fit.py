@@ -156,7 +156,7 @@ def test_draws_have_the_moments_of_the_modes(window_prior):
 
 def test_postures_unlike_the_clips_have_wider_intervals(window_prior, monkeypatch):
     monkeypatch.setattr(window_prior, "scales", np.array([4.0]))
-    _, seen = observed(window_prior, noise=4.0)
+    truth, seen = observed(window_prior, noise=4.0)
     posterior = lift(window_prior, CAMERA, seen, np.full(20, 4.0), candidates=1)
     mode, part = posterior.best, window_prior.component(posterior.best.component)
     square = [
@@ -164,14 +164,19 @@ def test_postures_unlike_the_clips_have_wider_intervals(window_prior, monkeypatc
         for z, frequency, ground in zip(mode.mean, part.frequency, part.ground, strict=False)
         if frequency == 0 and not ground
     ]
-    assert mode.posture == pytest.approx(np.mean(square))
+    assert np.mean(square) > 1.5
+    assert mode.inflation == pytest.approx(1.7 * np.sqrt(np.mean(square)))
+    for disagreement, factor in ((0.005, 1.0), (0.024, 8.0)):
+        unknown = np.full((len(truth), len(LIMBS)), np.inf)
+        given = replace(seen, depths=EstimatedDepths(depths(truth), unknown, RAYS, disagreement))
+        wider = lift(window_prior, CAMERA, given, np.full(20, 4.0), candidates=1).best
+        assert wider.inflation == pytest.approx(factor * mode.inflation)
 
-    def spread(posture: float) -> float:
-        changed = replace(posterior, modes=(replace(mode, posture=posture),))
+    def spread(inflation: float) -> float:
+        changed = replace(posterior, modes=(replace(mode, inflation=inflation),))
         return changed.sample(np.random.default_rng(0), 50, np.arange(20.0)).std(axis=0).mean()
 
-    assert spread(4.0) == pytest.approx(2 * spread(1.0))
-    assert spread(0.1) == spread(1.0)
+    assert spread(4.0) == pytest.approx(2 * spread(2.0))
 
 
 def test_draws_continue_earlier_ones(window_prior):
