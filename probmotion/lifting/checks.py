@@ -10,10 +10,11 @@ import numpy as np
 
 from probmotion.lifting.camera import LevelCamera
 from probmotion.lifting.keypoints import LIMBS, PERSON, PersonKeypoints, averaged
+from probmotion.lifting.window_fit import AGREED
 from probmotion.lifting.window_posterior import WindowSummary
 from probmotion.models.unseen_depth.pose_depth import DepthEstimate
 
-__all__ = ["MEDIAN", "Check", "Evidence", "checked", "checked_motion"]
+__all__ = ["MEDIAN", "Check", "Evidence", "checked", "unusual"]
 
 MEDIAN = 1.66
 """Median of squared residuals of a keypoint under Student-t noise with 4 degrees of freedom."""
@@ -66,7 +67,7 @@ _ANKLES, _HIPS = (
 _STEP, _LAG = 1 / 15, 2  # keypoints are averaged over _STEP seconds and compared _LAG steps apart
 _FEWEST, _SHARE = 10, 0.1  # visible frames of the joints whose residuals are checked
 # Chosen on lifts of clips that a prior and a network had not seen: of 129 with errors below 100 mm,
-# one is above ``mirrored`` and one above ``depths`` (1.1 times the largest value of the others).
+# one is above ``mirrored`` and one above ``unusual`` (1.1 times the largest value of the others).
 # ``unsteady`` and ``mirrored`` have to be low enough for moving cameras and mirrored videos.
 _LIMITS = {
     "noise": (0.04, "the keypoints' noise is more than 4 cm at the person's distance"),
@@ -77,7 +78,7 @@ _LIMITS = {
         "the motion is more likely with left and right exchanged (is the video mirrored?)",
     ),
 }
-_SURPRISE, _AMBIGUOUS = 1.75, 0.0117  # the latter in metres
+_UNUSUAL = 2.75
 
 
 def checked(evidence: Evidence) -> tuple[Check, ...]:
@@ -111,30 +112,22 @@ def checked(evidence: Evidence) -> tuple[Check, ...]:
     )
 
 
-def checked_motion(
+def unusual(
     windows: Sequence[WindowSummary], depths: DepthEstimate, keypoints: PersonKeypoints
-) -> tuple[Check, Check]:
-    """Return the checks of a motion that one camera alone does not determine.
+) -> Check:
+    """Return the check of a motion that one camera alone does not determine.
 
-    ``surprise``: mean square of standardised coefficients of the motion, median over windows.
-    ``depths``: median over visible joints of how much an image and its mirror image disagree on
-    depths, metres. It is large for animals, random keypoints and people who crawl or roll.
+    ``unusual``: mean square of standardised coefficients of the motion, median over windows, plus
+    the disagreement on depths between an image and its mirror image, median over visible joints,
+    in units of ``AGREED``. Either is large for animals and for people who crawl or roll.
     """
     shown = keypoints.weight[:, LIMBS] > 0
-    return (
-        Check(
-            "surprise",
-            float(np.median([window.surprise for window in windows])),
-            _SURPRISE,
-            "the motion is unlike those from which the prior was learnt",
-        ),
-        Check(
-            "depths",
-            float(np.median(depths.disagreement[shown])),
-            _AMBIGUOUS,
-            "postures are unlike those from which depths were learnt (another animal, swapped "
-            "joints?)",
-        ),
+    surprise = np.median([window.surprise for window in windows])
+    return Check(
+        "unusual",
+        float(surprise + np.median(depths.disagreement[shown]) / AGREED),
+        _UNUSUAL,
+        "the motion is unlike those from which this was learnt (another animal, swapped joints?)",
     )
 
 

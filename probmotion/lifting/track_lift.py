@@ -12,7 +12,7 @@ import numpy as np
 from probmotion import seeds
 from probmotion.geometry.rotations import vector_to_matrix
 from probmotion.lifting.camera import LevelCamera
-from probmotion.lifting.checks import MEDIAN, Check, Evidence, checked, checked_motion
+from probmotion.lifting.checks import MEDIAN, Check, Evidence, checked, unusual
 from probmotion.lifting.keypoints import (
     LIMBS,
     PERSON,
@@ -130,10 +130,10 @@ def lift_track(
     floor = float(np.median([summary.floor for summary in summaries]))
     mirrored = other.score - estimate.score
     evidence = Evidence(keypoints, fps, found, level, mean, mirrored)
-    unusual = checked_motion(summaries, windows.depths, windows.keypoints)
+    checks = (*checked(evidence), unusual(summaries, windows.depths, windows.keypoints))
     if pitch is None:
         _tilt(chains, seed)
-    return TrackLift(mean, chains, floor, found, level, (*checked(evidence), *unusual))
+    return TrackLift(mean, chains, floor, found, level, checks)
 
 
 def _windows(keypoints: PersonKeypoints, fps: float) -> _Windows:

@@ -35,8 +35,17 @@ from probmotion.lifting.window_posterior import (
 )
 from probmotion.lifting.window_prior import WindowPrior
 
-__all__ = ["PROPORTIONS", "EstimatedDepths", "Observed", "lift_window", "lift_window_views"]
+__all__ = [
+    "AGREED",
+    "PROPORTIONS",
+    "EstimatedDepths",
+    "Observed",
+    "lift_window",
+    "lift_window_views",
+]
 
+AGREED = 0.006
+"""Largest disagreement on depths of an image and its mirror image that is usual, metres."""
 PROPORTIONS = 0.03
 """Relative standard deviation of a bone's length between people."""
 _FREEDOM = 4.0  # degrees of freedom of the keypoints' noise
@@ -48,7 +57,6 @@ _NEAR = 2  # headings of one component that are this close are one candidate
 _WIDE = 3.0  # factor of the noise in the first round
 _SMALL = 1e-4  # probability of modes that are left out
 _INFLATION = (1.7, 2.0)  # of standard deviations, with one camera and with several
-_AGREED = 0.006  # largest disagreement on depths that does not widen intervals, metres
 
 
 class EstimatedDepths(NamedTuple):
@@ -295,7 +303,7 @@ def _inflation(several: bool, posture: float, disagreement: float) -> float:
     posture's standardised coefficients is above 1, and where the regression of depths disagrees
     with itself. Factors and powers were chosen on clips that prior and regression had not seen.
     """
-    unusual = max(1.0, disagreement / _AGREED) ** 1.5
+    unusual = max(1.0, disagreement / AGREED) ** 1.5
     return _INFLATION[several] * max(1.0, posture) ** 0.5 * unusual
 
 
