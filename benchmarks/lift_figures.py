@@ -22,7 +22,7 @@ PERSON = Skeleton.preset("person14")
 SEEN = [j for j, name in enumerate(PERSON.joint_names) if name not in ("pelvis", "neck")]
 HIPS = [PERSON.joint_names.index(f"{side}_hip") for side in ("left", "right")]
 WALKS = ("cmu_02_02", "humanoid3d_long_walk3")
-FRAMES, VIEWS = 150, 8  # of each clip, whose azimuths are all
+FRAMES, VIEWS = 150, 8  # of each clip
 HEIGHTS = (1.0, 2.2)  # of the cameras, metres
 GOOD = 100.0  # largest mean error of lifts that should not be flagged, mm
 MADE = 100  # videos of each kind that must be flagged
@@ -44,9 +44,9 @@ def lift_figures(folder: Path, lifter_folder: Path | None = None) -> Iterator[tu
     flagged = []
     for number, clip in enumerate(held_out(folder)):
         for view in range(VIEWS):
-            # Each azimuth has one of two heights, the other one for the next clip.
-            turn = (view + number) % 8
-            video = film(clip, number, azimuth=turn * np.pi / 4, height=HEIGHTS[view % 2])
+            # Heights alternate between azimuths, and between clips.
+            azimuth = (view + number) % VIEWS * 2 * np.pi / VIEWS
+            video = film(clip, number, azimuth=azimuth, height=HEIGHTS[view % 2])
             result = lifted(video)
             kind = "walk" if clip.name.startswith(WALKS) else "other"
             rows[kind].append(errors(result, video))

@@ -306,12 +306,12 @@ def _size(recording: _Recording, apparent: float, starts: Sequence[int], noise: 
 
 
 def _worst(evidence: Sequence[Evidence], proportions: float) -> tuple[Check, ...]:
-    """Return some checks, each of the view with the largest value, with limits for V views.
+    """Return the checks of V views, those of each view with the largest value.
 
-    How usual postures are does not matter if several views determine them, but ``proportions`` do,
-    the mean square of standardised bone lengths. V views may have √V times the noise of one. Of
-    three or more views, one that contradicts the others is left with large residuals, while joints
-    of detectors and of the prior differ by less; two views would meet halfway.
+    ``proportions`` is the mean square of standardised bone lengths. How usual the motion is is not
+    checked, as several views determine it. V views may have √V times the noise of one. Of three or
+    more views, one that contradicts the others is left with large residuals, while joints of
+    detectors and of the prior differ by less; two views would meet halfway.
     """
     views = len(evidence)
     worst = {
@@ -329,10 +329,10 @@ def _worst(evidence: Sequence[Evidence], proportions: float) -> tuple[Check, ...
         limit=_CONTRADICTIONS[views > 2],
         problem="keypoints of a view contradict the others (calibration, synchronisation, person?)",
     )
-    body = Check(
+    bones = Check(
         "proportions",
         proportions,
         _PROPORTIONS,
         "the body has unusual proportions (another animal, swapped joints?)",
     )
-    return noise, residual, body, replace(worst["mirrored"], limit=0.0)
+    return noise, residual, bones, replace(worst["mirrored"], limit=0.0)

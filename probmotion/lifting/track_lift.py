@@ -63,11 +63,15 @@ class _Windows(NamedTuple):
         spread = np.where(shown, _DEPENDENT * self.depths.spread[rows], np.inf)
         rays = camera.points(middle, np.ones(len(middle))) - camera.position
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        differences = self.depths.disagreement[rows][shown]
-        disagreement = float(np.median(differences)) if differences.size else 0.0
-        depths = EstimatedDepths(self.depths.depth[rows], spread, rays, disagreement)
+        depths = EstimatedDepths(self.depths.depth[rows], spread, rays, self.disagreement(rows))
         observed = Observed(seen, weight, noise, depths)
         return lift_window(self.prior, camera, observed, middle, depth, candidates=candidates)
+
+    def disagreement(self, rows: slice = slice(None)) -> float:
+        """Return how far an image and its mirror image disagree on depths, median, metres."""
+        shown = self.keypoints.weight[rows][:, LIMBS] > 0
+        differences = self.depths.disagreement[rows][shown]
+        return float(np.median(differences)) if differences.size else 0.0
 
     def mirrored(self) -> _Windows:
         """Return the windows with left and right exchanged."""
@@ -130,7 +134,7 @@ def lift_track(
     floor = float(np.median([summary.floor for summary in summaries]))
     mirrored = other.score - estimate.score
     evidence = Evidence(keypoints, fps, found, level, mean, mirrored)
-    checks = (*checked(evidence), unusual(summaries, windows.depths, windows.keypoints))
+    checks = (*checked(evidence), unusual(summaries, windows.disagreement()))
     if pitch is None:
         _tilt(chains, seed)
     return TrackLift(mean, chains, floor, found, level, checks)

@@ -45,7 +45,7 @@ __all__ = [
 ]
 
 AGREED = 0.006
-"""Largest disagreement on depths of an image and its mirror image that is usual, metres."""
+"""Disagreement on depths of an image and its mirror image above which intervals widen, metres."""
 PROPORTIONS = 0.03
 """Relative standard deviation of a bone's length between people."""
 _FREEDOM = 4.0  # degrees of freedom of the keypoints' noise
@@ -70,7 +70,7 @@ class EstimatedDepths(NamedTuple):
     values: np.ndarray
     sd: np.ndarray
     rays: np.ndarray
-    disagreement: float = 0.0
+    disagreement: float
 
 
 @dataclass(frozen=True, eq=False)

@@ -54,7 +54,7 @@ def window(number):
     depths = PoseDepth.load().estimate(points[:, LIMBS], weight[:, LIMBS] > 0, *path, prior.fps)
     spread = np.where(weight[:, LIMBS] > 0, _DEPENDENT * depths.spread, np.inf)
     rays = np.repeat(camera.axes[2:], len(points), axis=0)
-    seen = Observed(normalised, weight, 4.0, EstimatedDepths(depths.depth, spread, rays))
+    seen = Observed(normalised, weight, 4.0, EstimatedDepths(depths.depth, spread, rays, 0.0))
     return prior, camera, seen, camera.normalised(path.middle), depth
 
 

@@ -72,7 +72,7 @@ def test_estimated_depths_count_by_their_standard_deviations(window_prior):
     truth, seen = observed(window_prior)
 
     def error(sd: float, depth: np.ndarray) -> float:
-        known = replace(seen, depths=EstimatedDepths(depth, np.full(depth.shape, sd), RAYS))
+        known = replace(seen, depths=EstimatedDepths(depth, np.full(depth.shape, sd), RAYS, 0.0))
         posterior = lift(window_prior, CAMERA, known, np.full(20, 4.3))
         return np.abs(depths(posterior.mean(np.arange(20.0))) - depths(truth)).mean()
 
@@ -90,7 +90,7 @@ def test_scores_of_windows_are_normalised_over_depths(window_prior):
 
     def score(sd: float) -> float:
         depth = depths(truth)
-        known = replace(seen, depths=EstimatedDepths(depth, np.full(depth.shape, sd), RAYS))
+        known = replace(seen, depths=EstimatedDepths(depth, np.full(depth.shape, sd), RAYS, 0.0))
         return lift(window_prior, CAMERA, known, np.full(20, 4.3), candidates=1).best.score
 
     assert score(1e6) - score(1e7) == pytest.approx(20 * len(LIMBS) * np.log(10))
@@ -101,7 +101,7 @@ def test_rows_of_depths_are_those_of_the_motion(window_prior):
     rng = np.random.default_rng(0)
     shape = (len(truth), len(LIMBS))
     noisy = depths(truth) + 0.05 * rng.standard_normal(shape)
-    given = EstimatedDepths(noisy, rng.uniform(0.05, 0.2, shape), RAYS)
+    given = EstimatedDepths(noisy, rng.uniform(0.05, 0.2, shape), RAYS, 0.0)
     known = replace(seen, depths=given)
     posterior = lift(window_prior, CAMERA, known, np.full(20, 4.3), candidates=1)
     mode = posterior.best
@@ -131,7 +131,9 @@ def test_the_posterior_at_a_scale_is_that_of_a_system_with_its_deviations(window
     first, other = (WindowGaussian(window_prior, 2, 5, scale) for scale in (1.0, 2.0))
     solutions = []
     for gaussian in (first, other):
-        rows = _depth_rows(gaussian, EstimatedDepths(depths(truth), np.full((20, 12), 0.1), RAYS))
+        rows = _depth_rows(
+            gaussian, EstimatedDepths(depths(truth), np.full((20, 12), 0.1), RAYS, 0.0)
+        )
         system = _system(window_prior, gaussian, keypoints, rows, truth, force)
         solutions.append(system.solution(other.deviation / gaussian.deviation))
     for scaled, built in zip(*solutions, strict=True):

@@ -23,7 +23,8 @@ def time_limit(seconds: float | None) -> Iterator[None]:
     """Raise :class:`TimeLimitExceeded` if the block takes longer than ``seconds``.
 
     In the main thread of a system with interval timers the block is interrupted, between two
-    Python instructions; elsewhere the error is raised at the end of the block. None means no limit.
+    Python instructions, and again if it goes on; elsewhere the error is raised at the end of the
+    block. None means no limit.
     """
     if seconds is None:
         yield
@@ -57,12 +58,13 @@ def _alarm(seconds: float) -> Iterator[None]:
         if inside:
             raise _Alarm
 
-    before = signal.signal(signal.SIGALRM, interrupt)
-    # Python ignores an exception that is raised in a destructor or in a callback of the garbage
-    # collector: the alarm repeats. Clean-up has as long as the block had.
-    remaining, interval = signal.setitimer(signal.ITIMER_REAL, seconds, seconds)
     start = time.monotonic()
+    remaining, interval = signal.getitimer(signal.ITIMER_REAL)
+    before = signal.signal(signal.SIGALRM, interrupt)
     try:
+        # Python ignores an exception that is raised in a destructor or in a callback of the garbage
+        # collector: the alarm repeats. Clean-up has at least a second.
+        signal.setitimer(signal.ITIMER_REAL, seconds, max(seconds, 1.0))
         yield
     finally:
         inside = False

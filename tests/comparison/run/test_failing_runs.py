@@ -197,6 +197,25 @@ def test_a_time_limit_is_not_lost_in_a_destructor(monkeypatch):
     assert time.monotonic() - start < 10
 
 
+def test_clean_up_has_a_second():
+    events = []
+
+    def block():
+        try:
+            time.sleep(20)
+        finally:
+            time.sleep(0.3)
+            events.append("cleaned")
+
+    handler = signal.getsignal(signal.SIGALRM)
+    for seconds in (1e-5, 0.1):
+        with pytest.raises(TimeLimitExceeded), time_limit(seconds):
+            block()
+        assert signal.getsignal(signal.SIGALRM) is handler
+        assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+    assert events[-1:] == ["cleaned"]
+
+
 def test_a_time_limit_that_a_library_wraps_is_recognised():
     def library():
         try:
