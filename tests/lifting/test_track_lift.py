@@ -68,21 +68,21 @@ def test_depths_of_joints_that_are_not_seen_do_not_count(video, lifted):
 
 def test_intervals_are_wider_where_depths_of_visible_joints_disagree(video, lifted):
     windows = _windows(person_keypoints(video.track), video.track.fps)
-    unseen = windows.keypoints.weight[:, LIMBS] == 0
+    hidden = np.isin(LIMBS, LIMBS[:7])
 
-    def inflation(disagreement, hidden=slice(0)):
-        keypoints = windows.keypoints
-        weight = keypoints.weight.copy()
-        weight[hidden] = 0.0
+    def inflation(of_hidden, of_visible):
+        weight = windows.keypoints.weight.copy()
+        weight[:, LIMBS[:7]] = 0.0
+        shape = windows.depths.disagreement.shape
+        disagreement = np.broadcast_to(np.where(hidden, of_hidden, of_visible), shape)
         changed = windows._replace(
-            keypoints=keypoints._replace(weight=weight),
+            keypoints=windows.keypoints._replace(weight=weight),
             depths=windows.depths._replace(disagreement=disagreement),
         )
         return changed.posterior(0, lifted.camera, 4.0).best.inflation
 
-    agreed = inflation(np.where(unseen, 1.0, 0.0))
-    assert inflation(np.where(unseen, 0.0, 0.024)) == pytest.approx(8 * agreed)
-    assert np.isfinite(inflation(np.full(unseen.shape, 0.024), hidden=slice(None)))
+    assert inflation(1.0, 0.0) == inflation(0.0, 0.0)
+    assert inflation(0.0, 0.024) == pytest.approx(8 * inflation(0.0, 0.0))
 
 
 def test_exchanged_sides_have_depths_of_their_own(video):
