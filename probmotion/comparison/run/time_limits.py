@@ -68,6 +68,7 @@ def _alarm(seconds: float) -> Iterator[None]:
         yield
     finally:
         inside = False
+        signal.setitimer(signal.ITIMER_REAL, 0)
         # Resume a timer of the caller.
         rest = max(remaining - (time.monotonic() - start), 1e-6) if remaining else 0.0
         signal.signal(signal.SIGALRM, before)
