@@ -63,8 +63,8 @@ frames at 15 per second, for `probmotion lift` with one camera ({parameters:.1f}
 - **Provenance**: as `cmu-motion.md`.
 - **Not for**: bodies that are not people's, rolled cameras, and postures unlike the clips', such
   as lying and getting up, without wide intervals.
-- **Calibration**: 90 % intervals of lifts, which use these depths, contain 93 % of the coordinates in walking and
-  85 % in all held-out clips, but 47 to 66 % with one real detector (docs/how-to/lift.md).
+- **Calibration**: 90 % intervals of lifts, which use these depths, contain 93 % of the coordinates in walking,
+  90 % in all held-out clips, and 78 to 97 % with one real detector (docs/how-to/lift.md).
 
 | | clips | depth: mean absolute error, mm | pitch in a video: mean absolute error |
 |---|---|---|---|
