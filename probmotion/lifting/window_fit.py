@@ -57,6 +57,7 @@ _NEAR = 2  # headings of one component that are this close are one candidate
 _WIDE = 3.0  # factor of the noise in the first round
 _SMALL = 1e-4  # probability of modes that are left out
 _INFLATION = (1.7, 2.0)  # of standard deviations, with one camera and with several
+_WIDEST = 3.0  # largest further factor where depths disagree: draws should still be people
 
 
 class EstimatedDepths(NamedTuple):
@@ -303,7 +304,7 @@ def _inflation(several: bool, posture: float, disagreement: float) -> float:
     posture's standardised coefficients is above 1, and where the regression of depths disagrees
     with itself. Factors and powers were chosen on clips that prior and regression had not seen.
     """
-    unusual = max(1.0, disagreement / AGREED) ** 1.5
+    unusual = min(max(1.0, disagreement / AGREED) ** 2, _WIDEST)
     return _INFLATION[several] * max(1.0, posture) ** 0.5 * unusual
 
 

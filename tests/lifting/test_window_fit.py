@@ -168,7 +168,7 @@ def test_postures_unlike_the_clips_have_wider_intervals(window_prior, monkeypatc
     ]
     assert np.mean(square) > 1.5
     assert mode.inflation == pytest.approx(1.7 * np.sqrt(np.mean(square)))
-    for disagreement, factor in ((0.005, 1.0), (0.024, 8.0)):
+    for disagreement, factor in ((0.005, 1.0), (0.009, 2.25), (0.1, 3.0)):
         unknown = np.full((len(truth), len(LIMBS)), np.inf)
         given = replace(seen, depths=EstimatedDepths(depths(truth), unknown, RAYS, disagreement))
         wider = lift(window_prior, CAMERA, given, np.full(20, 4.0), candidates=1).best
