@@ -64,8 +64,7 @@ fig.tight_layout()
 # ## 2. The lift
 #
 # The result is a posterior: `mean` is a motion in metres, `draws` are 100 motions that explain the keypoints as well.
-# The first sentence of the summary says whether to trust it. Every check compares a number with the largest one of
-# lifts that can be trusted.
+# The first sentence of the summary says whether to trust it. Every check compares a number with its limit.
 
 # %%
 result = pm.lift(track, image_size=video.size, progress=False)
@@ -152,7 +151,7 @@ print(f"{smpl}, rotations {smpl.rotations.shape}")
 #
 # A small person close to the camera looks like a tall one farther away, and so does a longer focal length. Without
 # `--fov`, 60° are assumed (which is right here); without `--height`, people are 1.7 m tall; without `--pitch`, the angle of
-# the camera is estimated, well for walks and badly for motion unlike the prior's.
+# the camera is estimated, and badly for motion unlike the prior's.
 
 # %%
 hip_path = truth.positions[:, hips].mean(axis=1)

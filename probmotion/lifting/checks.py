@@ -28,7 +28,7 @@ class Check:
     name : str
         Name of the quantity.
     value, limit : float
-        Its value, and the largest value of lifts that can be trusted.
+        Its value, and the largest one with which the lift is trusted.
     problem : str
         What a larger value says.
     """
@@ -77,7 +77,7 @@ _LIMITS = {
         "the motion is more likely with left and right exchanged (is the video mirrored?)",
     ),
 }
-# As above, of 129 lifts: 1.1 times the largest value but one.
+# Chosen likewise: 1.1 times the largest value of 128 lifts; that of a crawl is larger.
 _UNUSUAL = 2.75
 
 
