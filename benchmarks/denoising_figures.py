@@ -14,7 +14,7 @@ import numpy as np
 
 from probmotion.data.denoising_clips import denoising_clips
 from probmotion.data.joint_filters import kalman_smooth
-from probmotion.models.mixture.denoising import denoise_joints
+from probmotion.models.mixture.denoising import DenoisedJoints, denoise_joints
 from probmotion.motion.motion import Motion
 from probmotion.posteriors.likelihoods import Joints3D
 from probmotion.problems.denoising import limb_occlusions
@@ -41,13 +41,7 @@ def denoising_figures(folder: Path) -> Figures:
         occlusion = limb_occlusions(window)
         names.append(window.name)
         for name, hidden in (("noise", np.zeros_like(occlusion)), ("occluded", occlusion)):
-            seen = Joints3D.observe(window, NOISE, number + 100 * repeat, hidden=hidden)
-            confidence = seen.entries.confidence
-            smooth, _ = kalman_smooth(seen.joints, confidence, noise=NOISE, fps=window.fps)
-            found = denoise_joints(
-                seen.joints, confidence, skeleton=window.skeleton, fps=window.fps, noise=NOISE,
-                draws=0, progress=False,
-            )  # fmt: skip
+            found, smooth = denoised(window, number + 100 * repeat, hidden, draws=0)
             pair = [
                 np.linalg.norm(mean - window.positions, axis=-1) for mean in (found.mean, smooth)
             ]
@@ -80,13 +74,7 @@ def learnt_figures(folder: Path) -> Figures:
     for number, window in enumerate(denoising_windows(folder)):
         truth, occlusion = window.positions, limb_occlusions(window)
         for name, hidden in (("noise", np.zeros_like(occlusion)), ("all", occlusion)):
-            seen = Joints3D.observe(window, NOISE, number, hidden=hidden)
-            confidence = seen.entries.confidence
-            smooth, _ = kalman_smooth(seen.joints, confidence, noise=NOISE, fps=window.fps)
-            found = denoise_joints(
-                seen.joints, confidence, skeleton=window.skeleton, fps=window.fps, noise=NOISE,
-                draws=200, progress=False,
-            )  # fmt: skip
+            found, smooth = denoised(window, number, hidden, draws=200)
             distances = []
             for method, iterations in zip(methods, (50, 0), strict=True):
                 start = time.perf_counter()
@@ -129,6 +117,20 @@ def learnt_figures(folder: Path) -> Figures:
         yield f"{method}_over_kalman", both[number] / both[3]
     for figure, values in rows.items():
         yield figure, float(np.mean(values))
+
+
+def denoised(
+    window: Motion, seed: int, hidden: np.ndarray, draws: int
+) -> tuple[DenoisedJoints, np.ndarray]:
+    """Return the posterior under the spectral prior and the Kalman smoother's mean, (L, J, 3)."""
+    seen = Joints3D.observe(window, NOISE, seed, hidden=hidden)
+    confidence = seen.entries.confidence
+    smooth, _ = kalman_smooth(seen.joints, confidence, noise=NOISE, fps=window.fps)
+    found = denoise_joints(
+        seen.joints, confidence, skeleton=window.skeleton, fps=window.fps, noise=NOISE,
+        draws=draws, progress=False,
+    )  # fmt: skip
+    return found, smooth
 
 
 def _acceleration(positions: np.ndarray) -> float:

@@ -151,7 +151,7 @@ print(f"{smpl}, rotations {smpl.rotations.shape}")
 #
 # A small person close to the camera looks like a tall one farther away, and so does a longer focal length. Without
 # `--fov`, 60° are assumed (which is right here); without `--height`, people are 1.7 m tall; without `--pitch`, the angle of
-# the camera is estimated, and badly for motion unlike the prior's.
+# the camera is estimated, less well for motion unlike the prior's.
 
 # %%
 hip_path = truth.positions[:, hips].mean(axis=1)

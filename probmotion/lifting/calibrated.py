@@ -306,12 +306,12 @@ def _size(recording: _Recording, apparent: float, starts: Sequence[int], noise: 
 
 
 def _worst(evidence: Sequence[Evidence], proportions: float) -> tuple[Check, ...]:
-    """Return the checks of V views, those of each view with the largest value.
+    """Return the checks of V views, each with its largest value over the views.
 
-    ``proportions`` is the mean square of standardised bone lengths. How usual the motion is is not
-    checked, as several views determine it. V views may have √V times the noise of one. Of three or
-    more views, one that contradicts the others is left with large residuals, while joints of
-    detectors and of the prior differ by less; two views would meet halfway.
+    ``proportions`` is the mean square of standardised bone lengths. Unusual motion is not marked,
+    as several views determine it. V views may have √V times the noise of one. Of three or more
+    views, one that contradicts the others is left with large residuals, while joints of detectors
+    and of the prior differ by less; two views would meet halfway.
     """
     views = len(evidence)
     worst = {

@@ -53,7 +53,7 @@ class Lift:
     swapped : float
         Share of arms and legs whose sides were exchanged before lifting.
     checks : tuple of Check
-        Checks of whether to trust it.
+        Checks of the lift.
     """
 
     mean: Motion

@@ -36,13 +36,8 @@ from probmotion.lifting.window_posterior import (
 from probmotion.lifting.window_prior import WindowPrior
 
 __all__ = [
-    "AGREED",
-    "PROPORTIONS",
-    "EstimatedDepths",
-    "Observed",
-    "lift_window",
-    "lift_window_views",
-]
+    "AGREED", "PROPORTIONS", "EstimatedDepths", "Observed", "lift_window", "lift_window_views",
+]  # fmt: skip
 
 AGREED = 0.006
 """Disagreement on depths of an image and its mirror image above which intervals widen, metres."""
