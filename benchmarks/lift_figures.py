@@ -15,18 +15,25 @@ from probmotion.data.synthetic.gaits import make_gait
 from probmotion.data.videos import Video, film, quadruped_as_person
 from probmotion.io.files import load
 from probmotion.lifting import Lift, lift
+from probmotion.motion.inverse_kinematics import rigid_motion
 from probmotion.motion.motion import Motion
 from probmotion.motion.skeleton import Skeleton
 
 PERSON = Skeleton.preset("person14")
 SEEN = [j for j, name in enumerate(PERSON.joint_names) if name not in ("pelvis", "neck")]
-HIPS = [PERSON.joint_names.index(f"{side}_hip") for side in ("left", "right")]
-WALKS = ("cmu_02_02", "humanoid3d_long_walk3")
+HIPS, ANKLES = (
+    [PERSON.joint_names.index(f"{side}_{part}") for side in ("left", "right")]
+    for part in ("hip", "ankle")
+)
+JOG, STEPS = "deepmimic_human/humanoid3d_jog.npz", 4  # a loop that is in no split; repetitions
+GAITS = ("cmu_02_02", "humanoid3d_long_walk3", "humanoid3d_jog")
 FRAMES, VIEWS = 150, 8  # of each clip
 HEIGHTS = (1.0, 2.2)  # of the cameras, metres
 GOOD = 100.0  # largest mean error of lifts that should not be flagged, mm
 MADE = 100  # videos of each kind that must be flagged
 COMPARED = 3  # frames of each video that the baseline lifts
+FOVS = (40.0, 50.0, 75.0, 90.0)  # degrees; 60° in all other videos
+SLOW, LOW, NEAR = 0.2, 0.05, 0.02  # of feet that stand, m/s and metres; metres from their level
 
 
 def lift_figures(folder: Path, lifter_folder: Path | None = None) -> Iterator[tuple[str, float]]:
@@ -41,14 +48,16 @@ def lift_figures(folder: Path, lifter_folder: Path | None = None) -> Iterator[tu
     rows: dict[str, list[tuple[float, float, float]]] = {"walk": [], "other": []}
     compared: dict[str, list[list[float]]] = {"walk": [], "other": []}
     baseline: dict[str, list[list[float]]] = {"walk": [], "other": []}
-    flagged = []
+    flagged, standing = [], []
     for number, clip in enumerate(held_out(folder)):
         for view in range(VIEWS):
             # Heights alternate between azimuths, and between clips.
             azimuth = (view + number) % VIEWS * 2 * np.pi / VIEWS
             video = film(clip, number, azimuth=azimuth, height=HEIGHTS[view % 2])
             result = lifted(video)
-            kind = "walk" if clip.name.startswith(WALKS) else "other"
+            kind = "walk" if clip.name.startswith(GAITS) else "other"
+            if kind == "walk":
+                standing.append(feet(result, video))
             rows[kind].append(errors(result, video))
             if rows[kind][-1][0] <= GOOD:
                 flagged.append(not result.trusted)
@@ -64,6 +73,10 @@ def lift_figures(folder: Path, lifter_folder: Path | None = None) -> Iterator[tu
     yield "lift_all_coverage_90", float(every[:, 1].mean())
     yield "lift_root_error", float(np.median(every[:, 2]))
     yield "lift_flagged_good", float(np.mean(flagged))
+    near, speed = np.nanmean(standing, axis=0)
+    yield "lift_walk_feet_within_2_cm", near
+    yield "lift_walk_standing_feet_mm_per_s", 1000 * speed
+    yield from other_views(folder)
     for name, values in (("walk", compared["walk"]), ("all", compared["walk"] + compared["other"])):
         lifts, single, directed = np.nanmedian(values, axis=0)
         yield f"lift_{name}_single_pose_mpjpe_mm", single
@@ -90,12 +103,70 @@ def held_out(folder: Path) -> list[Motion]:
     clips = denoising_clips(folder)["test"]
     clips += [load(path) for path in sorted((folder / "cmu_actions").glob("soccer*.npz"))]
     moving = [clip.retarget(PERSON).resample(30.0) for clip in clips]
+    moving.append(repeated(load(folder / JOG).retarget(PERSON)))
     return [clip.window(0, min(FRAMES, clip.frames)) for clip in moving if clip.frames >= 60]
 
 
-def lifted(video: Video) -> Lift:
+def repeated(loop: Motion) -> Motion:
+    """Return repetitions of a motion whose last posture is about its first."""
+    moved = (loop.positions[-1, 0] - loop.positions[0, 0]) * [1.0, 0.0, 1.0]
+    gap = loop.positions[-1] - loop.positions[0] - moved
+    cycle = (loop.positions - np.linspace(0, 1, loop.frames)[:, None, None] * gap)[:-1]
+    return replace(loop, positions=np.concatenate([cycle + n * moved for n in range(STEPS)]))
+
+
+def lifted(video: Video, fov: float | None = None) -> Lift:
     """Return the lift of a video."""
-    return lift(video.track, image_size=video.size, progress=False)
+    return lift(video.track, image_size=video.size, fov=fov, progress=False)
+
+
+def other_views(folder: Path) -> Iterator[tuple[str, float]]:
+    """Yield figures of videos with other fields of view, given or not.
+
+    ``lift_distance_coverage_90`` is the share of videos in which the draws' 90 % interval contains
+    the mean distance.
+    """
+    rows: dict[str, list[tuple[float, float, float]]] = {"": [], "_known_fov": []}
+    inside = []
+    for number, clip in enumerate(held_out(folder)):
+        for view, fov in enumerate(FOVS):
+            azimuth = (2 * view + number) % 8 * np.pi / 4
+            video = film(clip, number, azimuth=azimuth, height=HEIGHTS[view % 2], fov=fov)
+            result = lifted(video)
+            rows[""].append(errors(result, video))
+            rows["_known_fov"].append(errors(lifted(video, fov), video))
+            distances = np.linalg.norm(result.draws[:, :, 0, [0, 2]], axis=-1).mean(axis=1)
+            true = np.linalg.norm(video.motion.positions[:, 0, [0, 2]], axis=-1).mean()
+            low, high = np.quantile(distances, [0.05, 0.95])
+            inside.append(low <= true <= high)
+    for name, values in rows.items():
+        mpjpe, coverage, root = np.array(values).T
+        yield f"lift_other_fov_mpjpe_mm{name}", float(np.median(mpjpe))
+        yield f"lift_other_fov_coverage_90{name}", float(coverage.mean())
+        yield f"lift_other_fov_root_error{name}", float(np.median(root))
+    yield "lift_distance_coverage_90", float(np.mean(inside))
+
+
+def feet(result: Lift, video: Video) -> tuple[float, float]:
+    """Return how feet stand where the true ones do, NaN if they never do.
+
+    First, the share of frames in which an ankle of the exported motion is within 2 cm of its median
+    height, then the median speed of the lifted ankles.
+    """
+    true, mean, rigid = (
+        motion.positions[:, ANKLES]
+        for motion in (video.motion, result.mean, rigid_motion(result.mean))
+    )
+    speed, own = (
+        np.linalg.norm(np.gradient(x, 1 / video.motion.fps, axis=0), axis=-1) for x in (true, mean)
+    )
+    height = true[..., 1] - np.quantile(true[..., 1], 0.05)
+    stands = (speed < SLOW) & (height < LOW)
+    if not stands.any():
+        return np.nan, np.nan
+    heights = rigid[stands][:, 1]
+    near = np.abs(heights - np.median(heights)) < NEAR
+    return float(near.mean()), float(np.median(own[stands]))
 
 
 def errors(result: Lift, video: Video) -> tuple[float, float, float]:

@@ -20,7 +20,7 @@ from probmotion.data.videos import Video, film
 from probmotion.geometry.cameras import Cameras
 from probmotion.lifting.camera import LevelCamera
 from probmotion.lifting.keypoints import averaged, body_path, from_hips, person_keypoints
-from probmotion.lifting.window_fit import PROPORTIONS
+from probmotion.lifting.linear_system import PROPORTIONS
 from probmotion.models.training.checkpoints import load_checkpoint
 from probmotion.models.training.settings import TrainingSettings
 from probmotion.models.training.trainer import train
@@ -43,6 +43,7 @@ FPS = 30.0
 VIEWS = 72  # videos of each part of a clip
 SPEEDS = 0.25  # largest logarithm of the factor of a video's speed
 LENGTH, SHORTEST = 150, 30  # frames of a video
+FOV, FOCALS = 60.0, 0.3  # median field of view, degrees; spread of the focal lengths' logarithm
 HEIGHTS = ((0.3, 1.5), (1.5, 4.0))  # of cameras, metres; either with probability 1/2
 TRAINING = TrainingSettings(
     steps=16_000, batch=512, learning_rate=1e-3, halve_at=(6000, 9000, 11_000, 13_000, 14_500)
@@ -55,8 +56,8 @@ frames at 15 per second, for `probmotion lift` with one camera ({parameters:.1f}
 
 - **Data**: made videos (`probmotion.data.videos.film`) of the clips from which `cmu-motion` was
   fitted, {minutes:.1f} minutes, and of their mirror images: {videos} videos of up to 6.4 seconds, from
-  all sides, with cameras from 0.3 to 4 m high that look at the middle of the path, with bones 3 % longer
-  or shorter (standard deviation), and with a detector's noise, outliers, gaps and exchanged sides. Videos have
+  all sides, with cameras from 0.3 to 4 m high that look at the middle of the path, with fields of view of 39° to 87°
+  (90 % of them), with bones 3 % longer or shorter (standard deviation), and with a detector's noise, outliers, gaps and exchanged sides. Videos have
   speeds of 0.78 to 1.28 times those of the clips, and each arm is that of another clip in half of them. In three
   of ten inputs, joints are occluded for some time. Validation and test clips of the denoising study are held out, and the action soccer
   as a whole.
@@ -133,12 +134,14 @@ def examples(clips: Sequence[Motion], views: int = VIEWS, *, vary: bool = False)
                 continue
             for _ in range(views):
                 height = rng.uniform(*HEIGHTS[int(rng.integers(2))])
+                slope = np.tan(np.radians(FOV) / 2) * np.exp(FOCALS * rng.standard_normal())
                 seen = varied(part, others, rng) if vary else part
                 video = film(
                     reproportioned(seen, rng),
                     int(rng.integers(2**31)),
                     azimuth=rng.uniform(0, 2 * np.pi),
                     height=height,
+                    fov=np.degrees(2 * np.arctan(slope)),
                 )
                 arguments, target = example(video)
                 inputs.append(relative_keypoints(*arguments))

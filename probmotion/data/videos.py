@@ -14,7 +14,6 @@ from probmotion.motion.skeleton import Skeleton
 
 __all__ = ["Video", "film", "quadruped_as_person"]
 
-_FOCAL = 866.0  # pixels: a field of view of 60 degrees
 _SIZE = 1000  # width and height, pixels
 _NOISE = 4.0  # standard deviation, pixels
 _OUTLIERS, _FAR = 0.05, 60.0  # their share, and their standard deviation, pixels
@@ -38,7 +37,9 @@ class Video(NamedTuple):
     camera: Cameras
 
 
-def film(clip: Motion, seed: int, *, azimuth: float, height: float = 1.0) -> Video:
+def film(
+    clip: Motion, seed: int, *, azimuth: float, height: float = 1.0, fov: float = 60.0
+) -> Video:
     """Film a clip from so far that its whole path is visible.
 
     Keypoints have Gaussian noise of 4 pixels; 5 % are outliers, 10 % missing, and in some frames
@@ -54,6 +55,8 @@ def film(clip: Motion, seed: int, *, azimuth: float, height: float = 1.0) -> Vid
         Rotation of the clip about the vertical, radians.
     height : float
         Height of the camera, metres. It looks at a point 1 m above the floor.
+    fov : float
+        Field of view, degrees.
     """
     rng = seeds.generator(seed, "film")
     person = clip.retarget(Skeleton.preset("person14"))
@@ -62,7 +65,8 @@ def film(clip: Motion, seed: int, *, azimuth: float, height: float = 1.0) -> Vid
     ground = world[..., [0, 2]].reshape(-1, 2)
     middle = (ground.max(axis=0) + ground.min(axis=0)) / 2
     reach = np.abs(ground - middle).max(axis=0)
-    half = _MARGIN * _SIZE / (2 * _FOCAL)
+    focal = _SIZE / (2 * np.tan(np.radians(fov) / 2))
+    half = _MARGIN * _SIZE / (2 * focal)
     distance = max(reach[0], _REACH) / half + reach[1]
     place = np.array([middle[0], height, middle[1] + distance])
     positions = world - place
@@ -71,7 +75,7 @@ def film(clip: Motion, seed: int, *, azimuth: float, height: float = 1.0) -> Vid
     up = np.array([0.0, np.cos(pitch), np.sin(pitch)])
     depth = positions @ forward
     pixels = np.stack([positions[..., 0] / depth, -(positions @ up) / depth], axis=-1)
-    pixels = _FOCAL * pixels + _SIZE / 2
+    pixels = focal * pixels + _SIZE / 2
     pixels += _NOISE * rng.standard_normal(pixels.shape)
     far = rng.random(pixels.shape[:2]) < _OUTLIERS
     pixels[far] += _FAR * rng.standard_normal((int(far.sum()), 2))
@@ -93,7 +97,7 @@ def film(clip: Motion, seed: int, *, azimuth: float, height: float = 1.0) -> Vid
     truth = Motion(positions, person.skeleton, clip.fps, name=clip.name)
     axes = np.stack([[1.0, 0.0, 0.0], -up, forward])[None]
     centre = np.full((1, 2), _SIZE / 2)
-    camera = Cameras(axes @ turn, -axes @ place, np.array([_FOCAL]), centre, orthographic=False)
+    camera = Cameras(axes @ turn, -axes @ place, np.array([focal]), centre, orthographic=False)
     return Video(track, truth, (_SIZE, _SIZE), camera)
 
 

@@ -25,8 +25,9 @@ from probmotion.lifting.keypoints import (
     person_keypoints,
     smooth_size,
 )
+from probmotion.lifting.linear_system import PROPORTIONS
 from probmotion.lifting.sides import consistent_sides
-from probmotion.lifting.window_fit import PROPORTIONS, Observed, lift_window_views
+from probmotion.lifting.window_fit import Observed, lift_window_views
 from probmotion.lifting.window_posterior import WindowPosterior
 from probmotion.lifting.window_prior import WindowPrior
 from probmotion.lifting.windows import cut, stitched

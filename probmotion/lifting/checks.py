@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from probmotion.lifting.camera import LevelCamera
-from probmotion.lifting.keypoints import PERSON, PersonKeypoints, averaged
+from probmotion.lifting.keypoints import ANKLES, HIPS, PersonKeypoints, averaged
 from probmotion.lifting.window_fit import AGREED
 from probmotion.lifting.window_posterior import WindowSummary
 
@@ -59,10 +59,6 @@ class Evidence(NamedTuple):
     mirrored: float
 
 
-_ANKLES, _HIPS = (
-    [PERSON.joint_names.index(f"{side}_{part}") for side in ("left", "right")]
-    for part in ("ankle", "hip")
-)
 _STEP, _LAG = 1 / 15, 2  # keypoints are averaged over _STEP seconds and compared _LAG steps apart
 _FEWEST, _SHARE = 10, 0.1  # visible frames of the joints whose residuals are checked
 # Chosen on lifts of clips that a prior and a network had not seen: few of those with errors below
@@ -141,9 +137,9 @@ def _unsteadiness(evidence: Evidence) -> float:
     distance = evidence.camera.depth(evidence.mean).mean(axis=1)[step // 2 :: step][: len(points)]
     scale = distance[_LAG:, None] / evidence.camera.focal * evidence.fps / (_LAG * step)
     velocity = (points[_LAG:, :, 0] - points[:-_LAG, :, 0]) * scale
-    seen = ((weight[_LAG:] > 0) & (weight[:-_LAG] > 0))[:, _ANKLES + _HIPS].all(axis=1)
+    seen = ((weight[_LAG:] > 0) & (weight[:-_LAG] > 0))[:, ANKLES + HIPS].all(axis=1)
     if not seen.any():
         return 0.0
-    slower = np.abs(velocity[seen][:, _ANKLES]).min(axis=1)
-    hips = velocity[seen][:, _HIPS].mean(axis=1)
+    slower = np.abs(velocity[seen][:, ANKLES]).min(axis=1)
+    hips = velocity[seen][:, HIPS].mean(axis=1)
     return float(min(np.median(slower), np.median(np.abs(hips - np.median(hips)))))

@@ -20,7 +20,10 @@ __all__ = [
 PERSON = Skeleton.preset("person14")
 # Neck and pelvis of detectors are midpoints of shoulders and hips, which motion capture has not.
 _TRUNK = ("neck", "pelvis")
-HIPS = [PERSON.joint_names.index(f"{side}_hip") for side in ("left", "right")]
+HIPS, ANKLES = (
+    [PERSON.joint_names.index(f"{side}_{part}") for side in ("left", "right")]
+    for part in ("hip", "ankle")
+)
 LIMBS = list(KEYPOINTS)
 """Joints of arms and legs."""
 SIDED = (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"))

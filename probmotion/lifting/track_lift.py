@@ -22,8 +22,9 @@ from probmotion.lifting.keypoints import (
     body_path,
     smooth_size,
 )
-from probmotion.lifting.window_fit import EstimatedDepths, Observed, lift_window
-from probmotion.lifting.window_posterior import WindowPosterior
+from probmotion.lifting.linear_system import EstimatedDepths
+from probmotion.lifting.window_fit import Observed, lift_window
+from probmotion.lifting.window_posterior import Height, WindowPosterior
 from probmotion.lifting.window_prior import WindowPrior
 from probmotion.lifting.windows import cut, stitched
 from probmotion.models.unseen_depth.pose_depth import DepthEstimate, PoseDepth
@@ -37,6 +38,7 @@ _DEPENDENT = 1.4  # factor of the estimated depths' sd: frames' errors are corre
 _CANDIDATES = 5  # of a window whose noise and score are estimated
 _TRIED = 3  # windows on which the noise is estimated
 _FITTED = 0.8  # share of the residuals that the fit leaves
+_UNEVEN = 0.02  # smallest standard deviation of the floor, metres
 
 
 class _Windows(NamedTuple):
@@ -50,7 +52,13 @@ class _Windows(NamedTuple):
     step: int
 
     def posterior(
-        self, start: int, camera: LevelCamera, noise: float, *, candidates: int = 3
+        self,
+        start: int,
+        camera: LevelCamera,
+        noise: float,
+        *,
+        floor: Height | None = None,
+        candidates: int = 3,
     ) -> WindowPosterior:
         """Return the posterior of the window from a frame on."""
         rows = slice(start, start + self.prior.frames)
@@ -64,7 +72,7 @@ class _Windows(NamedTuple):
         rays = camera.points(middle, np.ones(len(middle))) - camera.position
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         depths = EstimatedDepths(self.depths.depth[rows], spread, rays, self.disagreement(rows))
-        observed = Observed(seen, weight, noise, depths)
+        observed = Observed(seen, weight, noise, depths, floor)
         return lift_window(self.prior, camera, observed, middle, depth, candidates=candidates)
 
     def disagreement(self, rows: slice = slice(None)) -> float:
@@ -123,7 +131,7 @@ def lift_track(
             )
         level, found = noise or estimate.noise, replace(camera, pitch=estimate.pitch)
         mean, chains, summaries = stitched(
-            lambda start: windows.posterior(start, found, level),
+            lambda start: windows.posterior(start, found, level, floor=estimate.floor),
             windows.starts,
             windows.step,
             len(keypoints.points),
@@ -131,7 +139,7 @@ def lift_track(
             seed,
             bar.update,
         )
-    floor = float(np.median([summary.floor for summary in summaries]))
+    floor = float(np.median([summary.floor.mean for summary in summaries]))
     mirrored = other.score - estimate.score
     evidence = Evidence(keypoints, fps, found, level, mean, mirrored)
     checks = (*checked(evidence), unusual(summaries, windows.disagreement()))
@@ -161,17 +169,18 @@ def _depths(keypoints: PersonKeypoints, path: BodyPath, fps: float) -> DepthEsti
 
 
 class _Estimate(NamedTuple):
-    """Mean score of windows, noise (pixels) and pitch (radians)."""
+    """Mean score of windows, noise (pixels), pitch (radians) and the floor's height."""
 
     score: float
     noise: float
     pitch: float
+    floor: Height
 
 
 def _estimated(
     windows: _Windows, camera: LevelCamera, noise: float, pitch: float | None
 ) -> _Estimate:
-    """Return the score and noise of some windows, at the estimated pitch if it is None."""
+    """Return what some windows tell, at the estimated pitch if it is None."""
     weight, length = windows.keypoints.weight, windows.prior.frames
     seen = [weight[start : start + length].sum() for start in windows.starts]
     order = np.argsort(seen)[::-1]
@@ -179,13 +188,18 @@ def _estimated(
     chosen = [chosen[i] for i in np.linspace(0, len(chosen) - 1, _TRIED).round().astype(int)]
     pitch = _pitch(windows, camera) if pitch is None else pitch
     tilted = replace(camera, pitch=pitch)
-    modes = [
-        windows.posterior(start, tilted, noise, candidates=_CANDIDATES).best
+    found = [
+        windows.posterior(start, tilted, noise, candidates=_CANDIDATES)
         for start in sorted(set(chosen))
     ]
+    modes = [posterior.best for posterior in found]
     squares = np.concatenate([mode.standardised[mode.standardised > 0] for mode in modes])
     noise = float(noise * np.sqrt(np.median(squares) / (MEDIAN * _FITTED)))
-    return _Estimate(float(np.mean([mode.score for mode in modes])), noise, pitch)
+    heights, spreads = np.array([posterior.summary.floor for posterior in found]).T
+    floor = float(np.average(heights, weights=spreads**-2))
+    spread = max(_UNEVEN, float((spreads**-2).sum() ** -0.5))
+    score = float(np.mean([mode.score for mode in modes]))
+    return _Estimate(score, noise, pitch, Height(floor, spread))
 
 
 def _pitch(windows: _Windows, camera: LevelCamera) -> float:

@@ -3,9 +3,10 @@
 The prior is a mixture of Gaussians, the camera a pinhole camera, and the noise Student-t. For each
 probable component and heading, the projection is linearised at the current mean (Gauss-Newton) and
 outliers have smaller weights, the expected precisions of the scale mixture. Bones have constant
-lengths: |X_j − X_parent| = l_j (1 + δ_j) ± 1 cm with one unknown δ_j for the window. With one
-camera, depths of joints that a regression estimates
-(:mod:`~probmotion.models.unseen_depth.pose_depth`) are further observations.
+lengths: |X_j − X_parent| = l_j (1 + δ_j) ± 1 cm with one unknown δ_j for the window. Feet stand or
+move (:mod:`~probmotion.lifting.linear_system`). With one camera, depths of joints that a regression
+estimates (:mod:`~probmotion.models.unseen_depth.pose_depth`) are further observations, and so is
+the floor, whose height is estimated from other windows too.
 
 Distances to the camera are hardly observed, and the density of all coefficients is largest at a
 motion that is too close and too small: closer motions need smaller deviations from the mean. The
@@ -18,33 +19,34 @@ joint away from the camera.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_triangular
 from scipy.ndimage import median_filter
 
 from probmotion.lifting.camera import LevelCamera, LevelCameras
-from probmotion.lifting.keypoints import HIPS, LIMBS
+from probmotion.lifting.linear_system import (
+    Ankles,
+    EstimatedDepths,
+    LinearKeypoints,
+    Solution,
+    depth_rows,
+    floor_rows,
+    linear_system,
+)
 from probmotion.lifting.window_posterior import (
-    FLOOR_SPREAD,
     TEMPER,
+    Height,
     WindowGaussian,
     WindowMode,
     WindowPosterior,
 )
 from probmotion.lifting.window_prior import WindowPrior
 
-__all__ = [
-    "AGREED", "PROPORTIONS", "EstimatedDepths", "Observed", "lift_window", "lift_window_views",
-]  # fmt: skip
+__all__ = ["AGREED", "Observed", "lift_window", "lift_window_views"]
 
 AGREED = 0.006
 """Disagreement on depths of an image and its mirror image above which intervals widen, metres."""
-PROPORTIONS = 0.03
-"""Relative standard deviation of a bone's length between people."""
 _FREEDOM = 4.0  # degrees of freedom of the keypoints' noise
-_BONE_NOISE = 0.01  # standard deviation of a bone's length between frames, metres
 _ROUNDS = 6  # of the linearisation
 _SCREENED = 40.0  # nats below the best component at which others are left out
 _FACTORS = (0.72, 0.85, 1.0, 1.18, 1.39)  # of the first estimate of the distance
@@ -53,20 +55,6 @@ _WIDE = 3.0  # factor of the noise in the first round
 _SMALL = 1e-4  # probability of modes that are left out
 _INFLATION = (1.7, 2.0)  # of standard deviations, with one camera and with several
 _WIDEST = 3.0  # largest further factor where depths disagree: draws should still be people
-
-
-class EstimatedDepths(NamedTuple):
-    """Depths of the joints of arms and legs behind the middle of the hips, as a regression says.
-
-    ``values`` and the standard deviations ``sd`` of their errors, infinite where unknown, are
-    (L, 12), metres. ``rays`` are the directions of depth, unit vectors (L, 3). ``disagreement`` is
-    that of an image and its mirror image, metres.
-    """
-
-    values: np.ndarray
-    sd: np.ndarray
-    rays: np.ndarray
-    disagreement: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,12 +71,15 @@ class Observed:
         Scale of the noise of a keypoint of weight 1, pixels.
     depths : EstimatedDepths, optional
         Of one view.
+    floor : Height, optional
+        Of the floor in the world of the camera.
     """
 
     points: np.ndarray
     weight: np.ndarray
     noise: float
     depths: EstimatedDepths | None = None
+    floor: Height | None = None
 
 
 def lift_window(
@@ -254,29 +245,35 @@ def _refined(
     scales = [1.0]
     visible = seen.weight > 0
     places = np.nonzero(visible)[-2:]
-    depths = _depth_rows(unit, seen.depths)
+    ankles, held = Ankles(unit, prior.fps), np.zeros((len(path) - 1, 2))
+    rows = depth_rows(unit, seen.depths), floor_rows(unit, seen.floor, float(origin[1]))
+    others = np.concatenate([row[0] for row in rows]), np.concatenate([row[1] for row in rows])
     # Densities of depths under different assumptions of sides have different scales.
     known = np.ones(0) if seen.depths is None else seen.depths.sd[np.isfinite(seen.depths.sd)]
     scale_of_depths = np.log(known).sum()
-    best: _Solution | None = None
+    best: Solution | None = None
     for number in range(_ROUNDS):
         matrix, target = camera.linearised(at, seen.points)
         target = target - matrix @ origin
         weight = seen.weight * outliers * (camera.focal / (seen.noise * camera.depth(at))) ** 2
-        keypoints = _Linear(matrix[visible], target[visible], weight[visible], places)
-        system = _system(prior, unit, keypoints, depths, pose, force)
+        keypoints = LinearKeypoints(matrix[visible], target[visible], weight[visible], places)
+        system = linear_system(prior, unit, keypoints, (ankles, held), others, pose, force)
         best = None
         for scale in prior.scales.tolist() if number == 1 else scales:
             gaussian = WindowGaussian(prior, k, yaw, scale)
-            tried = system.solution(gaussian.deviation / unit.deviation)
+            factor = gaussian.deviation / unit.deviation
+            tried = system.solution(factor)
             positions = gaussian.positions(prior, k, tried.mean[None], np.arange(len(at)))[0]
             positions = positions + origin
             square = seen.weight * _squares(camera, seen, positions)
             fit = -0.5 * (_FREEDOM + 2) * np.log1p(square[visible] / _FREEDOM).sum()
+            moved = ankles.squares(factor * tried.mean[: len(factor)])
+            fit += ankles.log_factor(moved)
             score = float(tried.score + fit + prior.log_weights[k] - scale_of_depths)
             if best is None or score > best.score:
                 best = tried._replace(score=score)
                 scales, at, pose, standardised = [scale], positions, positions, square
+                held = ankles.standing(moved)
         assert best is not None
         outliers = (_FREEDOM + 2) / (_FREEDOM + standardised)
         leverage = np.zeros(visible.shape)
@@ -303,81 +300,6 @@ def _inflation(several: bool, posture: float, disagreement: float) -> float:
     return _INFLATION[several] * max(1.0, posture) ** 0.5 * unusual
 
 
-class _Linear(NamedTuple):
-    """Keypoints A X = t of n positions X about the origin, and precisions of the two sides.
-
-    ``matrix`` is (n, 2, 3), ``target`` (n, 2), ``weight`` (n,), ``places`` their frames and joints.
-    """
-
-    matrix: np.ndarray
-    target: np.ndarray
-    weight: np.ndarray
-    places: tuple[np.ndarray, ...]
-
-
-class _Solution(NamedTuple):
-    """Gaussian posterior of the coefficients, its log mass, and the design of the keypoints."""
-
-    mean: np.ndarray
-    lower: np.ndarray
-    score: float
-    design: np.ndarray
-
-    @property
-    def leverage(self) -> np.ndarray:
-        """Leverages of the keypoints, (n,)."""
-        half = solve_triangular(self.lower, self.design.T, lower=True)
-        total: np.ndarray = (half**2).sum(axis=0).reshape(-1, 2).sum(axis=1)
-        return total
-
-
-class _System(NamedTuple):
-    """Linear observations of a Gaussian's standard normal coefficients, in units of their noise.
-
-    The first ``rows`` are those of keypoints. ``gram`` is Dᵀ D of the design D, ``pull`` is Dᵀ y
-    for the residual y, plus the force.
-    """
-
-    design: np.ndarray
-    residual: np.ndarray
-    gram: np.ndarray
-    pull: np.ndarray
-    rows: int
-
-    def solution(self, factor: np.ndarray) -> _Solution:
-        """Return the posterior with the component's deviations multiplied by a factor, (r,)."""
-        n = self.rows
-        factors = np.ones(len(self.pull))
-        factors[: len(factor)] = factor
-        precision = factors[:, None] * self.gram * factors
-        precision[np.diag_indices(len(factors))] += 1.0
-        lower = np.linalg.cholesky(precision)
-        z = solve_triangular(lower, factors * self.pull, lower=True)
-        z = solve_triangular(lower, z, lower=True, trans=1)
-        off = self.residual[n:] - self.design[n:] @ (factors * z)
-        score = -0.5 * (z @ z + off @ off) - np.log(np.diag(lower)).sum()
-        return _Solution(z, lower, score, self.design[:n] * factors)
-
-
-def _depth_rows(
-    gaussian: WindowGaussian, depths: EstimatedDepths | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return design (m, r) and residuals (m,) of estimated depths, in units of their noise."""
-    part, sd = gaussian.part, gaussian.deviation
-    if depths is None:
-        return np.zeros((0, len(sd))), np.zeros(0)
-    frames, limbs = np.nonzero(np.isfinite(depths.sd))
-    rays, spread = (depths.rays @ gaussian.rotation)[frames], depths.sd[frames, limbs]
-    joints = np.array(LIMBS)[limbs]
-    basis, mean = (
-        values[frames, joints] - values[:, HIPS].mean(axis=1)[frames]
-        for values in (part.basis, part.mean)
-    )
-    design = (rays[:, None] @ basis)[:, 0] * sd / spread[:, None]
-    residual = (depths.values[frames, limbs] - (mean * rays).sum(axis=-1)) / spread
-    return design, residual
-
-
 def _squares(
     camera: LevelCamera | LevelCameras, seen: Observed, positions: np.ndarray
 ) -> np.ndarray:
@@ -386,42 +308,3 @@ def _squares(
     residual = (seen.points - camera.project(positions)) * focal / seen.noise
     square: np.ndarray = (residual**2).sum(axis=-1)
     return square
-
-
-def _system(
-    prior: WindowPrior,
-    gaussian: WindowGaussian,
-    keypoints: _Linear,
-    depths: tuple[np.ndarray, np.ndarray],
-    pose: np.ndarray,
-    force: np.ndarray,
-) -> _System:
-    """Return the system of linear observations, bones about a pose and a force."""
-    part, R, sd = gaussian.part, gaussian.rotation, gaussian.deviation
-    matrix, target, weight, places = keypoints
-    L, J = pose.shape[:2]
-    r, bones = len(sd), J - 1
-    q, n = r + 1 + bones, 2 * len(weight)
-    m = n + L * bones
-    root = np.sqrt(weight)[..., None]
-    turned = (matrix * root[..., None]) @ R
-    design, residual = np.zeros((m + len(depths[1]), q)), np.empty(m + len(depths[1]))
-    design[:n, :r] = ((turned @ part.basis[places]) * sd).reshape(n, r)
-    design[:n, r] = (matrix[..., 1] * root).ravel() * FLOOR_SPREAD
-    residual[:n] = (target * root - (turned @ part.mean[places][..., None])[..., 0]).ravel()
-    # Bones, linearised along their current directions.
-    along = pose[:, prior.children] - pose[:, prior.parents]
-    along = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), _BONE_NOISE) @ R
-    spread = (part.directions[prior.children] - part.directions[prior.parents]) * sd
-    cosines = prior.cosines(np.arange(L))[:, part.frequency] / _BONE_NOISE
-    rows = (along.swapaxes(0, 1) @ spread).swapaxes(0, 1) * cosines[:, None]
-    design[n:m, :r] = rows.reshape(L * bones, r)
-    own = np.arange(L * bones)
-    design[n + own, r + 1 + own % bones] = -np.tile(part.bones, L) * PROPORTIONS / _BONE_NOISE
-    average = part.mean[:, prior.children] - part.mean[:, prior.parents]
-    residual[n:m] = (part.bones - (along * average).sum(axis=-1)).ravel() / _BONE_NOISE
-    design[m:, :r], residual[m:] = depths
-    pull = design.T @ residual
-    pull[:r] += np.tensordot(force @ R, part.basis, axes=3) * sd
-    pull[r] += force[..., 1].sum() * FLOOR_SPREAD
-    return _System(design, residual, design.T @ design, pull, n)

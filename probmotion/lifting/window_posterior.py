@@ -12,7 +12,8 @@ from probmotion.lifting.window_prior import WindowPrior
 from probmotion.models.mixture.conditioning import rotation
 
 __all__ = [
-    "FLOOR_SPREAD", "TEMPER", "WindowGaussian", "WindowMode", "WindowPosterior", "WindowSummary",
+    "FLOOR_SPREAD", "TEMPER", "Height", "WindowGaussian", "WindowMode", "WindowPosterior",
+    "WindowSummary",
 ]  # fmt: skip
 
 FLOOR_SPREAD = 0.3
@@ -80,14 +81,21 @@ class WindowGaussian:
         return out.reshape(len(times) * J * 3, -1)
 
 
+class Height(NamedTuple):
+    """Mean and standard deviation of a height, metres."""
+
+    mean: float
+    sd: float
+
+
 class WindowSummary(NamedTuple):
     """Floor and usualness of the most probable mode of a window.
 
-    ``floor`` is its height, metres. ``surprise`` and ``proportions`` are mean squares of
-    standardised coefficients of the motion and of bone lengths.
+    ``surprise`` and ``proportions`` are mean squares of standardised coefficients of the motion and
+    of bone lengths.
     """
 
-    floor: float
+    floor: Height
     surprise: float
     proportions: float
 
@@ -120,14 +128,19 @@ class WindowPosterior:
         """Floor and usualness of the most probable mode."""
         best, bones = self.best, len(self.prior.children)
         return WindowSummary(
-            float(self.origin[1] + self.floor(best)),
+            self._floor(best),
             float(best.scale * (best.mean[:-bones] ** 2).mean()),
             float((best.mean[-bones:] ** 2).mean()),
         )
 
-    def floor(self, mode: WindowMode) -> float:
-        """Return the height of the floor relative to the window's origin, metres."""
-        return float(FLOOR_SPREAD * mode.mean[len(self.prior.component(mode.component).variance)])
+    def _floor(self, mode: WindowMode) -> Height:
+        """Return the height of the floor, metres."""
+        place = len(self.prior.component(mode.component).variance)
+        unit = np.zeros(len(mode.mean))
+        unit[place] = FLOOR_SPREAD
+        half = solve_triangular(mode.lower, unit, lower=True)
+        height = self.origin[1] + FLOOR_SPREAD * mode.mean[place]
+        return Height(float(height), float(mode.inflation * np.sqrt(half @ half)))
 
     def mean(self, times: np.ndarray) -> np.ndarray:
         """Return the posterior mean at times in frames of the window, (T, J, 3)."""

@@ -17,6 +17,7 @@ from probmotion.data.videos import film
 from probmotion.lifting import window_fit
 from probmotion.lifting.camera import LevelCamera
 from probmotion.lifting.keypoints import (
+    ANKLES,
     LIMBS,
     PERSON,
     averaged,
@@ -24,9 +25,10 @@ from probmotion.lifting.keypoints import (
     person_keypoints,
     smooth_size,
 )
+from probmotion.lifting.linear_system import PROPORTIONS, EstimatedDepths
 from probmotion.lifting.track_lift import _DEPENDENT
-from probmotion.lifting.window_fit import PROPORTIONS, EstimatedDepths, Observed, lift_window
-from probmotion.lifting.window_posterior import WindowGaussian
+from probmotion.lifting.window_fit import Observed, lift_window
+from probmotion.lifting.window_posterior import FLOOR_SPREAD, WindowGaussian
 from probmotion.lifting.windows import cut
 from probmotion.models.unseen_depth.pose_depth import PoseDepth
 
@@ -58,7 +60,7 @@ def window(number):
     return prior, camera, seen, camera.normalised(path.middle), depth
 
 
-def log_density(z, design, offset, camera, seen, prior, bones):
+def log_density(z, design, offset, origin, camera, seen, prior, bones):
     """Return the unnormalised log density of one component's standardised coefficients."""
     positions = (design @ z).reshape(offset.shape) + offset
     plane, depth = positions @ camera.axes[:2].T, positions @ camera.axes[2]
@@ -68,9 +70,15 @@ def log_density(z, design, offset, camera, seen, prior, bones):
     lengths = bones * (1 + PROPORTIONS * z[-len(bones) :])
     stretch = (jnp.linalg.norm(bone, axis=-1) - lengths) / 0.01
     off = (about_hips(positions) @ camera.axes[2] - seen.depths.values) / seen.depths.sd
+    ankles = positions[:, jnp.array(ANKLES)]
+    speeds = (jnp.diff(ankles, axis=0) ** 2).sum(axis=-1) * prior.fps**2
+    floor = origin[1] + FLOOR_SPREAD * z[-len(bones) - 1]
+    heights = (ankles[1:, :, 1] + ankles[:-1, :, 1]) / 2 - floor
+    moved = speeds / 0.12**2 + (heights - 0.075) ** 2 / 0.015**2
     # Student-t with four degrees of freedom in two dimensions.
     gaussian = z @ z + (stretch**2).sum() + (off**2).sum()
-    return -0.5 * gaussian - 3 * jnp.log1p(square / 4).sum()
+    feet = jnp.log1p(90 * jnp.exp(-moved / 2)).sum()
+    return -0.5 * gaussian - 3 * jnp.log1p(square / 4).sum() + feet
 
 
 def draws_of_nuts(log_density, mode, number):
@@ -130,6 +138,7 @@ def compared(number):
         log_density,
         design=design,
         offset=offset,
+        origin=posterior.origin,
         camera=camera,
         seen=seen,
         prior=prior,

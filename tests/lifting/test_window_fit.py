@@ -6,16 +6,17 @@ import pytest
 from probmotion.data.synthetic.gaits import make_gait
 from probmotion.geometry.rotations import vector_to_matrix
 from probmotion.lifting.camera import LevelCamera
-from probmotion.lifting.keypoints import HIPS, LIMBS, PERSON
-from probmotion.lifting.window_fit import (
+from probmotion.lifting.keypoints import ANKLES, HIPS, LIMBS, PERSON
+from probmotion.lifting.linear_system import (
+    Ankles,
     EstimatedDepths,
-    Observed,
-    _depth_rows,
-    _Linear,
-    _system,
-    lift_window,
+    LinearKeypoints,
+    depth_rows,
+    floor_rows,
+    linear_system,
 )
-from probmotion.lifting.window_posterior import WindowGaussian
+from probmotion.lifting.window_fit import Observed, lift_window
+from probmotion.lifting.window_posterior import FLOOR_SPREAD, Height, WindowGaussian
 
 CAMERA = LevelCamera(900.0, (500.0, 500.0), -0.1)
 RAYS = np.repeat(CAMERA.axes[2:], 20, axis=0)
@@ -45,8 +46,7 @@ def test_a_likely_motion_is_found(window_prior):
     assert mean[:, 8, 2].mean() == pytest.approx(truth[:, 8, 2].mean(), rel=0.1)
     assert posterior.best.standardised.mean() < 2
     # The floor of the truth is 1.2 m below the camera.
-    floor = posterior.origin[1] + posterior.floor(posterior.best)
-    assert floor == pytest.approx(-1.2, abs=0.06)
+    assert posterior.summary.floor.mean == pytest.approx(-1.2, abs=0.06)
 
 
 def test_outliers_do_not_move_the_motion(window_prior):
@@ -106,7 +106,7 @@ def test_rows_of_depths_are_those_of_the_motion(window_prior):
     posterior = lift(window_prior, CAMERA, known, np.full(20, 4.3), candidates=1)
     mode = posterior.best
     gaussian = WindowGaussian(window_prior, mode.component, mode.yaw, mode.scale)
-    rows, residual = _depth_rows(gaussian, given)
+    rows, residual = depth_rows(gaussian, given)
     r = rows.shape[1]
     at = np.arange(20.0)
 
@@ -120,21 +120,79 @@ def test_rows_of_depths_are_those_of_the_motion(window_prior):
     assert np.allclose(off(mode.mean) - off(mode.mean + step), rows[:, 3])
 
 
+def test_rows_of_ankles_are_those_of_the_motion(window_prior):
+    _, seen = observed(window_prior)
+    mode = lift(window_prior, CAMERA, seen, np.full(20, 4.3), candidates=1).best
+    gaussian = WindowGaussian(window_prior, mode.component, mode.yaw, mode.scale)
+    z = mode.mean + 0.3 * np.random.default_rng(0).standard_normal(mode.mean.shape)
+    moved = gaussian.positions(window_prior, mode.component, z[None], np.arange(20.0))[0]
+    r = len(gaussian.deviation)
+    moved[..., 1] -= FLOOR_SPREAD * z[r]
+    feet = moved[:, ANKLES]
+    velocity = (feet[1:] - feet[:-1]) * window_prior.fps
+    height = (feet[1:, :, 1] + feet[:-1, :, 1]) / 2
+    square = (velocity**2).sum(axis=-1) / 0.12**2 + ((height - 0.075) / 0.015) ** 2
+    assert Ankles(gaussian, window_prior.fps).squares(z[:r]) == pytest.approx(square)
+
+
+def test_the_probability_of_standing_is_the_precision_of_the_factor():
+    squares = np.array([[0.0, 0.3], [4.0, 9.0]])
+    # A precision is minus twice the derivative of the log factor by the square.
+    slopes = [Ankles.log_factor(row + 1e-6) - Ankles.log_factor(row) for row in squares]
+    standing = Ankles.standing(squares).sum(axis=1)
+    assert np.array(slopes) == pytest.approx(-0.5e-6 * standing, rel=1e-4)
+    assert Ankles.standing(np.array([0.0, 900.0])) == pytest.approx([90 / 91, 0.0])
+
+
+def test_standing_feet_are_held_and_others_are_not(window_prior, monkeypatch):
+    walk, _ = observed(window_prior)
+    lowest = walk[:, ANKLES, 1].max(axis=1).argmin()
+    still = np.repeat(walk[lowest : lowest + 1], len(walk), axis=0)
+    noise = 8 / CAMERA.focal * np.random.default_rng(0).standard_normal((*walk.shape[:2], 2))
+
+    def speed(truth: np.ndarray) -> float:
+        seen = Observed(CAMERA.project(truth) + noise, np.ones(truth.shape[:2]), 8.0)
+        positions = lift(window_prior, CAMERA, seen, np.full(20, 4.3)).mean(np.arange(20.0))
+        steps = np.diff(positions[:, ANKLES], axis=0) * window_prior.fps
+        return float(np.median(np.linalg.norm(steps, axis=-1)))
+
+    held, swung = speed(still), speed(walk)
+    monkeypatch.setattr(Ankles, "standing", staticmethod(np.zeros_like))
+    assert held < 0.5 * speed(still)
+    assert swung == pytest.approx(speed(walk), rel=0.1)
+
+
+def test_a_known_floor_counts_by_its_standard_deviation(window_prior):
+    _, seen = observed(window_prior)
+
+    def floor(height: Height | None) -> Height:
+        known = replace(seen, floor=height)
+        return lift(window_prior, CAMERA, known, np.full(20, 4.3)).summary.floor
+
+    alone, exact = floor(None), floor(Height(-1.1, 1e-4))
+    assert exact.mean == pytest.approx(-1.1, abs=1e-3)
+    assert exact.sd < 1e-3 < alone.sd
+    assert floor(Height(-1.1, 1e3)) == pytest.approx(alone, rel=1e-3)
+
+
 def test_the_posterior_at_a_scale_is_that_of_a_system_with_its_deviations(window_prior):
     truth, seen = observed(window_prior)
     seen.weight[3:7, 2:9] = 0.0
     visible = seen.weight > 0
     matrix, target = CAMERA.linearised(truth, seen.points)
     weight = np.full(visible.sum(), 1e4)
-    keypoints = _Linear(matrix[visible], target[visible], weight, np.nonzero(visible))
+    keypoints = LinearKeypoints(matrix[visible], target[visible], weight, np.nonzero(visible))
     force = np.random.default_rng(0).standard_normal(truth.shape)
+    held = np.random.default_rng(1).random((len(truth) - 1, 2))
     first, other = (WindowGaussian(window_prior, 2, 5, scale) for scale in (1.0, 2.0))
     solutions = []
     for gaussian in (first, other):
-        rows = _depth_rows(
-            gaussian, EstimatedDepths(depths(truth), np.full((20, 12), 0.1), RAYS, 0.0)
-        )
-        system = _system(window_prior, gaussian, keypoints, rows, truth, force)
+        given = EstimatedDepths(depths(truth), np.full((20, 12), 0.1), RAYS, 0.0)
+        floor = floor_rows(gaussian, Height(-1.2, 0.1), -1.3)
+        rows = zip(depth_rows(gaussian, given), floor, strict=True)
+        others = tuple(map(np.concatenate, rows))
+        standing = Ankles(gaussian, window_prior.fps), held
+        system = linear_system(window_prior, gaussian, keypoints, standing, others, truth, force)
         solutions.append(system.solution(other.deviation / gaussian.deviation))
     for scaled, built in zip(*solutions, strict=True):
         assert np.allclose(scaled, built)
@@ -157,7 +215,7 @@ def test_draws_have_the_moments_of_the_modes(window_prior):
 
 
 def test_postures_unlike_the_clips_have_wider_intervals(window_prior, monkeypatch):
-    monkeypatch.setattr(window_prior, "scales", np.array([4.0]))
+    monkeypatch.setattr(window_prior, "scales", np.array([5.0]))
     truth, seen = observed(window_prior, noise=4.0)
     posterior = lift(window_prior, CAMERA, seen, np.full(20, 4.0), candidates=1)
     mode, part = posterior.best, window_prior.component(posterior.best.component)
