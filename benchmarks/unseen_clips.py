@@ -12,6 +12,7 @@ coverage, and how many lifts with errors below and above 100 mm the checks mark.
 from __future__ import annotations
 
 import argparse
+import json
 from collections import defaultdict
 from functools import lru_cache, partial
 from pathlib import Path
@@ -44,8 +45,10 @@ def main() -> None:
     for part in ("train", "actions"):
         unseen += [clip for clip in parts[part] if clip.name.startswith(names)]
         parts[part] = [clip for clip in parts[part] if not clip.name.startswith(names)]
+    if not unseen:
+        parser.error(f"clips must be starts of names of training clips, got {' '.join(names)}")
     with one_thread():
-        fit(parts, options.out)
+        fit(parts, sorted(clip.name for clip in unseen), options.out)
         rows = measured(unseen, options.out)
     for kind, values in rows.items():
         good = values[:, 0] <= GOOD
@@ -57,9 +60,13 @@ def main() -> None:
         print(f"unseen_{kind}_flagged_bad: {values[~good, 3].sum():.0f} of {(~good).sum()}")
 
 
-def fit(parts: dict[str, list[Motion]], out: Path) -> None:
+def fit(parts: dict[str, list[Motion]], unseen: list[str], out: Path) -> None:
     """Write prior and network, unless they are there; an interrupted training is resumed."""
     out.mkdir(parents=True, exist_ok=True)
+    names = out / "unseen.json"
+    if names.exists() and json.loads(names.read_text(encoding="utf-8")) != unseen:
+        raise SystemExit(f"out must be a folder of the same clips, got {out}; use another")
+    names.write_text(json.dumps(unseen), encoding="utf-8")
     if not (out / "prior.npz").exists():
         priors = []
         for part, count in zip(("train", "actions"), COMPONENTS["person14"], strict=True):
@@ -77,10 +84,10 @@ def measured(clips: list[Motion], out: Path) -> dict[str, np.ndarray]:
     They are grouped by the names of the clips without their numbers.
     """
     network = PoseDepth.load(out / "depths.npz")
-    cut = lru_cache(partial(WindowPrior, SpectralMixtureMotion.load(out / "prior.npz")))
+    prior = lru_cache(partial(WindowPrior, SpectralMixtureMotion.load(out / "prior.npz")))
     rows = defaultdict(list)
     with (
-        patch.object(windows, "_prior", cut),
+        patch.object(windows, "_prior", prior),
         patch.object(track_lift, "_regression", lambda: network),
     ):
         for number, clip in enumerate(clips):

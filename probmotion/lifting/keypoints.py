@@ -13,8 +13,8 @@ from probmotion.motion.retargeting import counterpart
 from probmotion.motion.skeleton import Skeleton
 
 __all__ = [
-    "HIPS", "LIMBS", "SIDED", "BodyPath", "PersonKeypoints", "averaged", "body_path", "from_hips",
-    "person_keypoints", "smooth_size",
+    "ANKLES", "HIPS", "LIMBS", "SIDED", "BodyPath", "PersonKeypoints", "averaged", "body_path",
+    "from_hips", "person_keypoints", "smooth_size",
 ]  # fmt: skip
 
 PERSON = Skeleton.preset("person14")

@@ -170,21 +170,21 @@ def linear_system(
     prior: WindowPrior,
     gaussian: WindowGaussian,
     keypoints: LinearKeypoints,
-    standing: tuple[Ankles, np.ndarray],
+    feet: tuple[Ankles, np.ndarray],
     known: tuple[np.ndarray, np.ndarray],
     pose: np.ndarray,
     force: np.ndarray,
 ) -> _System:
     """Return the system of linear observations and a force.
 
-    ``standing`` are ankles with their precisions, ``known`` is the design and the residuals of
-    depths and the floor. Bones are linearised about a pose.
+    ``feet`` are the ankles and the probabilities that they stand, ``known`` is the design and the
+    residuals of depths and the floor. Bones are linearised about a pose.
     """
     part, R, sd = gaussian.part, gaussian.rotation, gaussian.deviation
     matrix, target, weight, places = keypoints
     L, J = pose.shape[:2]
     r, bones = len(sd), J - 1
-    (ankles, precision), (lines, left) = standing, known
+    (ankles, standing), (lines, left) = feet, known
     q, k = r + 1 + bones, 2 * len(weight)
     n = k + ankles.residual.size
     m = n + L * bones
@@ -193,10 +193,10 @@ def linear_system(
     design, residual = np.zeros((m + len(left), q)), np.empty(m + len(left))
     design[:k, :r] = ((turned @ part.basis[places]) * sd).reshape(k, r)
     design[:k, r] = (matrix[..., 1] * root).ravel() * FLOOR_SPREAD
-    held = np.sqrt(precision)[..., None]
+    residual[:k] = (target * root - (turned @ part.mean[places][..., None])[..., 0]).ravel()
+    held = np.sqrt(standing)[..., None]
     design[k:n, :r] = (ankles.design * held[..., None]).reshape(n - k, r)
     residual[k:n] = (ankles.residual * held).ravel()
-    residual[:k] = (target * root - (turned @ part.mean[places][..., None])[..., 0]).ravel()
     # Bones, linearised along their current directions.
     along = pose[:, prior.children] - pose[:, prior.parents]
     along = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), _BONE_NOISE) @ R

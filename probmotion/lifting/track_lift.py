@@ -35,8 +35,8 @@ __all__ = ["TrackLift", "lift_track"]
 
 _PITCH_ERROR = np.radians(3.5)  # standard deviation of draws' pitches about the estimate
 _DEPENDENT = 1.4  # factor of the estimated depths' sd: frames' errors are correlated
-_CANDIDATES = 5  # of a window whose noise and score are estimated
-_TRIED = 3  # windows on which the noise is estimated
+_CANDIDATES = 5  # of a window whose noise, score and floor are estimated
+_TRIED = 3  # windows on which they are estimated
 _FITTED = 0.8  # share of the residuals that the fit leaves
 _UNEVEN = 0.02  # smallest standard deviation of the floor, metres
 
@@ -196,10 +196,19 @@ def _estimated(
     squares = np.concatenate([mode.standardised[mode.standardised > 0] for mode in modes])
     noise = float(noise * np.sqrt(np.median(squares) / (MEDIAN * _FITTED)))
     heights, spreads = np.array([posterior.summary.floor for posterior in found]).T
-    floor = float(np.average(heights, weights=spreads**-2))
-    spread = max(_UNEVEN, float((spreads**-2).sum() ** -0.5))
     score = float(np.mean([mode.score for mode in modes]))
-    return _Estimate(score, noise, pitch, Height(floor, spread))
+    return _Estimate(score, noise, pitch, _shared(heights, spreads))
+
+
+def _shared(heights: np.ndarray, spreads: np.ndarray) -> Height:
+    """Return the floor's height from those of windows; one alone tells others nothing.
+
+    With a wrong pitch, they differ with the distance, so that their variance counts too.
+    """
+    weights = spreads**-2 / (spreads**-2).sum()
+    mean = float(weights @ heights)
+    variance = weights @ (heights - mean) ** 2 + 1 / (spreads**-2).sum()
+    return Height(mean, max(_UNEVEN, float(variance**0.5)) if len(heights) > 1 else np.inf)
 
 
 def _pitch(windows: _Windows, camera: LevelCamera) -> float:

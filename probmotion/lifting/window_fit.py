@@ -6,7 +6,7 @@ outliers have smaller weights, the expected precisions of the scale mixture. Bon
 lengths: |X_j − X_parent| = l_j (1 + δ_j) ± 1 cm with one unknown δ_j for the window. Feet stand or
 move (:mod:`~probmotion.lifting.linear_system`). With one camera, depths of joints that a regression
 estimates (:mod:`~probmotion.models.unseen_depth.pose_depth`) are further observations, and so is
-the floor, whose height is estimated from other windows too.
+the height of the floor, estimated in several windows.
 
 Distances to the camera are hardly observed, and the density of all coefficients is largest at a
 motion that is too close and too small: closer motions need smaller deviations from the mean. The

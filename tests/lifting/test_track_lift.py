@@ -6,7 +6,7 @@ import pytest
 from probmotion.data.synthetic.gaits import make_gait
 from probmotion.data.videos import film, quadruped_as_person
 from probmotion.geometry.rotations import vector_to_matrix
-from probmotion.lifting import lift
+from probmotion.lifting import lift, track_lift
 from probmotion.lifting.keypoints import LIMBS, PERSON, person_keypoints
 from probmotion.lifting.track_lift import _windows
 
@@ -247,3 +247,35 @@ def test_bad_input_is_refused(video, change, options, words):
         track = replace(track, confidence=confidence)
     with pytest.raises(ValueError, match=words):
         lift(track, **{"image_size": video.size, "progress": False} | options)
+
+
+def test_windows_share_the_floor(video, monkeypatch):
+    shared, found = [], {True: [], False: []}
+    fit = track_lift._Windows.posterior
+
+    def spy(windows, *arguments, floor=None, **options):
+        result = fit(windows, *arguments, floor=floor, **options)
+        if floor is not None:
+            shared.append(floor)
+            alone = fit(windows, *arguments, **options)
+            for one, known in ((result, True), (alone, False)):
+                found[known].append(one.summary.floor.mean)
+        return result
+
+    monkeypatch.setattr(track_lift._Windows, "posterior", spy)
+    lift(video.track, image_size=video.size, progress=False, draws=2)
+    assert len(shared) > 1
+    assert len(set(shared)) == 1
+    assert np.ptp(found[True]) < np.ptp(found[False])
+
+
+def test_the_floor_of_several_windows_is_as_certain_as_they_agree():
+    close, apart = (
+        track_lift._shared(np.array([-1.0, -1.0 + gap]), np.array([0.1, 0.05]))
+        for gap in (0.0, 0.5)
+    )
+    assert close == pytest.approx((-1.0, (100 + 400) ** -0.5))
+    assert apart.mean == pytest.approx(-1.0 + 0.8 * 0.5)
+    assert apart.sd == pytest.approx(np.sqrt(0.2 * 0.8 * 0.5**2 + 1 / 500))
+    alone = track_lift._shared(np.array([-1.0]), np.array([0.1]))
+    assert alone.sd == np.inf

@@ -16,7 +16,7 @@ from probmotion.lifting.linear_system import (
     linear_system,
 )
 from probmotion.lifting.window_fit import Observed, lift_window
-from probmotion.lifting.window_posterior import FLOOR_SPREAD, Height, WindowGaussian
+from probmotion.lifting.window_posterior import FLOOR_SPREAD, Height, WindowGaussian, WindowMode
 
 CAMERA = LevelCamera(900.0, (500.0, 500.0), -0.1)
 RAYS = np.repeat(CAMERA.axes[2:], 20, axis=0)
@@ -162,6 +162,22 @@ def test_standing_feet_are_held_and_others_are_not(window_prior, monkeypatch):
     assert swung == pytest.approx(speed(walk), rel=0.1)
 
 
+def test_standing_feet_count_for_the_score(window_prior, monkeypatch):
+    monkeypatch.setattr(window_prior, "scales", np.ones(1))
+    _, seen = observed(window_prior)
+
+    def mode() -> WindowMode:
+        return lift(window_prior, CAMERA, seen, np.full(20, 4.3), candidates=1).best
+
+    usual = mode()
+    gaussian = WindowGaussian(window_prior, usual.component, usual.yaw, usual.scale)
+    ankles = Ankles(gaussian, window_prior.fps)
+    factor = ankles.log_factor(ankles.squares(usual.mean[: len(gaussian.deviation)]))
+    monkeypatch.setattr(Ankles, "log_factor", staticmethod(lambda squares: 0.0))
+    assert factor > 10
+    assert usual.score - mode().score == pytest.approx(factor)
+
+
 def test_a_known_floor_counts_by_its_standard_deviation(window_prior):
     _, seen = observed(window_prior)
 
@@ -196,6 +212,12 @@ def test_the_posterior_at_a_scale_is_that_of_a_system_with_its_deviations(window
         solutions.append(system.solution(other.deviation / gaussian.deviation))
     for scaled, built in zip(*solutions, strict=True):
         assert np.allclose(scaled, built)
+    # Of the last system: ankles count by the probabilities that they stand.
+    rows = slice(system.keypoints, system.robust)
+    z = solutions[1].mean
+    off = (system.residual[rows] - system.design[rows] @ z).reshape(-1, 4)
+    squares = standing[0].squares(z[: len(other.deviation)])
+    assert (off**2).sum(axis=1) == pytest.approx((held * squares).ravel())
     leverage = solutions[0].leverage
     design = solutions[0].design
     covariance = np.linalg.inv(solutions[0].lower @ solutions[0].lower.T)
