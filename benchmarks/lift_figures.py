@@ -20,7 +20,7 @@ from probmotion.motion.inverse_kinematics import rigid_motion
 from probmotion.motion.motion import Motion
 
 SEEN = [j for j, name in enumerate(PERSON.joint_names) if name not in ("pelvis", "neck")]
-JOG, STEPS = "deepmimic_human/humanoid3d_jog.npz", 4  # a loop that is in no split; repetitions
+JOG, STEPS = "deepmimic_human/humanoid3d_jog.npz", 2  # a loop that is in no split; repetitions
 GAITS = ("cmu_02_02", "humanoid3d_long_walk3", "humanoid3d_jog")
 FRAMES, VIEWS = 150, 8  # of each clip
 HEIGHTS = (1.0, 2.2)  # of the cameras, metres
@@ -41,9 +41,9 @@ def lift_figures(folder: Path, lifter_folder: Path | None = None) -> Iterator[tu
 def usual_views(folder: Path, lifter_folder: Path | None = None) -> Iterator[tuple[str, float]]:
     """Yield figures of videos with the field of view that lifts assume.
 
-    They are medians over videos; coverages and figures of feet are means. ``walk`` is walking and
-    running. ``lift_all_over_single_pose`` is the ratio of the median errors of the lift and of
-    single poses lifted by joint limits (:mod:`single_pose_baseline`), in the same frames.
+    They are medians over videos; coverages are means. ``walk`` is walking and running.
+    ``lift_all_over_single_pose`` is the ratio of the median errors of the lift and of single poses
+    lifted by joint limits (:mod:`single_pose_baseline`), in the same frames.
     ``lift_all_over_unsupervised`` is that to the unsupervised lifter in ``lifter_folder``
     (:mod:`unsupervised_baseline`), in all frames, with estimated or known distance and pitch.
     """
@@ -76,9 +76,9 @@ def usual_views(folder: Path, lifter_folder: Path | None = None) -> Iterator[tup
     yield "lift_all_coverage_90", float(every[:, 1].mean())
     yield "lift_root_error", float(np.median(every[:, 2]))
     yield "lift_flagged_good", float(np.mean(flagged))
-    near, speed = np.nanmean(standing, axis=0)
-    yield "lift_walk_feet_within_2_cm", near
-    yield "lift_walk_standing_feet_mm_per_s", 1000 * speed
+    near, speed = map(np.concatenate, zip(*standing, strict=True))
+    yield "lift_walk_feet_within_2_cm", float(near.mean())
+    yield "lift_walk_standing_feet_mm_per_s", 1000 * float(np.median(speed))
     for name, values in (("walk", compared["walk"]), ("all", compared["walk"] + compared["other"])):
         lifts, single, directed = np.nanmedian(values, axis=0)
         yield f"lift_{name}_single_pose_mpjpe_mm", single
@@ -109,8 +109,8 @@ def held_out(folder: Path) -> list[Motion]:
     clips = denoising_clips(folder)["test"]
     clips += [load(path) for path in sorted((folder / "cmu_actions").glob("soccer*.npz"))]
     moving = [clip.retarget(PERSON).resample(30.0) for clip in clips]
-    moving.append(repeated(load(folder / JOG).retarget(PERSON)))
-    return [clip.window(0, min(FRAMES, clip.frames)) for clip in moving if clip.frames >= 60]
+    long = [clip.window(0, min(FRAMES, clip.frames)) for clip in moving if clip.frames >= 60]
+    return [*long, repeated(load(folder / JOG).retarget(PERSON))]
 
 
 def repeated(loop: Motion) -> Motion:
@@ -154,11 +154,11 @@ def other_views(folder: Path) -> Iterator[tuple[str, float]]:
     yield "lift_distance_coverage_90", float(np.mean(inside))
 
 
-def feet(result: Lift, video: Video) -> tuple[float, float]:
-    """Return how feet stand where the true ones do, NaN if they never do.
+def feet(result: Lift, video: Video) -> tuple[np.ndarray, np.ndarray]:
+    """Return how feet stand in all frames in which the true ones do.
 
-    First, the share of frames in which an ankle of the exported motion is within 2 cm of its median
-    height, then the median speed of the lifted ankles.
+    First, whether an ankle of the exported motion is within 2 cm of their median height, then the
+    speed of the lifted ankle, metres per second.
     """
     true, mean, rigid = (
         motion.positions[:, ANKLES]
@@ -169,11 +169,9 @@ def feet(result: Lift, video: Video) -> tuple[float, float]:
     )
     height = true[..., 1] - np.quantile(true[..., 1], 0.05)
     stands = (speed < SLOW) & (height < LOW)
-    if not stands.any():
-        return np.nan, np.nan
     heights = rigid[stands][:, 1]
-    near = np.abs(heights - np.median(heights)) < NEAR
-    return float(near.mean()), float(np.median(own[stands]))
+    level = np.median(heights) if len(heights) else 0.0
+    return np.abs(heights - level) < NEAR, own[stands]
 
 
 def errors(result: Lift, video: Video) -> tuple[float, float, float]:

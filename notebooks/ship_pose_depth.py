@@ -64,15 +64,15 @@ frames at 15 per second, for `probmotion lift` with one camera ({parameters:.1f}
 - **Provenance**: as `cmu-motion.md`.
 - **Not for**: bodies that are not people's, rolled cameras, and postures unlike the clips', such
   as lying and getting up, without wide intervals.
-- **Calibration**: 90 % intervals of lifts, which use these depths, contain 93 % of the coordinates in walking,
-  90 % in all held-out clips, and 78 to 97 % with one real detector (docs/how-to/lift.md).
+- **Calibration**: 90 % intervals of lifts, which use these depths, contain 93 % of the coordinates in walking
+  and running, 91 % in all held-out clips, and at least 89 % with one real detector (docs/how-to/lift.md).
 
 | | clips | depth: mean absolute error, mm | pitch in a video: mean absolute error |
 |---|---|---|---|
 {rows}
 
 Twelve joints of arms and legs, relative to the middle of the hips; two videos of each held-out
-clip with cameras at heights of 1 and 2.2 m; ±: standard error over clips. Commands (training on one thread of a shared CPU; no
+clip with a field of view of 60° and cameras at heights of 1 and 2.2 m; ±: standard error over clips. Commands (training on one thread of a shared CPU; no
 GPU was used):
 
     python notebooks/ship_pose_depth.py --data ../shared/data --out runs/pose-depth
