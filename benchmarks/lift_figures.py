@@ -155,7 +155,7 @@ def other_views(folder: Path) -> Iterator[tuple[str, float]]:
 
 
 def feet(result: Lift, video: Video) -> tuple[np.ndarray, np.ndarray]:
-    """Return how feet stand in all frames in which the true ones do.
+    """Return height and speed of the ankles in all frames in which the true ones stand.
 
     First, whether an ankle of the exported motion is within 2 cm of their median height, then the
     speed of the lifted ankle, metres per second.

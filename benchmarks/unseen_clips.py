@@ -1,4 +1,4 @@
-"""Lifts of clips without which the prior and the network of depths are fitted.
+"""Accuracy of lifts of clips that are left out of the training of prior and network.
 
     PYTHONPATH=notebooks python benchmarks/unseen_clips.py --data DATA --out runs/unseen \
         --clips running cmu_02_03
@@ -36,8 +36,12 @@ def main() -> None:
     """Print the figures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, required=True, help="Folder of the recordings.")
-    parser.add_argument("--out", type=Path, required=True, help="Folder of prior and network.")
-    parser.add_argument("--clips", nargs="+", required=True, help="Starts of clips' names.")
+    parser.add_argument(
+        "--out", type=Path, required=True, help="Folder for the prior and the network."
+    )
+    parser.add_argument(
+        "--clips", nargs="+", required=True, help="Starts of the names of clips that are left out."
+    )
     options = parser.parse_args()
     names = tuple(options.clips)
     parts = recordings(options.data, partial(Motion.retarget, skeleton=PERSON))
@@ -65,7 +69,9 @@ def fit(parts: dict[str, list[Motion]], unseen: list[str], out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     names = out / "unseen.json"
     if names.exists() and json.loads(names.read_text(encoding="utf-8")) != unseen:
-        raise SystemExit(f"out must be a folder of the same clips, got {out}; use another")
+        raise SystemExit(
+            f"out must be a folder in which the same clips are left out, got {out}; use another"
+        )
     names.write_text(json.dumps(unseen), encoding="utf-8")
     if not (out / "prior.npz").exists():
         priors = []

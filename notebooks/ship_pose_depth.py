@@ -57,7 +57,7 @@ frames at 15 per second, for `probmotion lift` with one camera ({parameters:.1f}
 - **Data**: made videos (`probmotion.data.videos.film`) of the clips from which `cmu-motion` was
   fitted, {minutes:.1f} minutes, and of their mirror images: {videos} videos of up to 6.4 seconds, from
   all sides, with cameras from 0.3 to 4 m high that look at the middle of the path, with fields of view of 39° to 87°
-  (90 % of them), with bones 3 % longer or shorter (standard deviation), and with a detector's noise, outliers, gaps and exchanged sides. Videos have
+  in 90 % of the videos, with bones 3 % longer or shorter (standard deviation), and with a detector's noise, outliers, gaps and exchanged sides. Videos have
   speeds of 0.78 to 1.28 times those of the clips, and each arm is that of another clip in half of them. In three
   of ten inputs, joints are occluded for some time. Validation and test clips of the denoising study are held out, and the action soccer
   as a whole.
@@ -65,7 +65,8 @@ frames at 15 per second, for `probmotion lift` with one camera ({parameters:.1f}
 - **Not for**: bodies that are not people's, rolled cameras, and postures unlike the clips', such
   as lying and getting up, without wide intervals.
 - **Calibration**: 90 % intervals of lifts, which use these depths, contain 93 % of the coordinates in walking
-  and running, 91 % in all held-out clips, and at least 89 % with one real detector (docs/how-to/lift.md).
+  and running, 91 % in all held-out clips, and at least 89 % in four single, calibrated views of one real recording
+  (docs/how-to/lift.md).
 
 | | clips | depth: mean absolute error, mm | pitch in a video: mean absolute error |
 |---|---|---|---|

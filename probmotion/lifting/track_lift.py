@@ -180,7 +180,7 @@ class _Estimate(NamedTuple):
 def _estimated(
     windows: _Windows, camera: LevelCamera, noise: float, pitch: float | None
 ) -> _Estimate:
-    """Return what some windows tell, at the estimated pitch if it is None."""
+    """Return the estimates of some windows; the pitch is the network's if it is None."""
     weight, length = windows.keypoints.weight, windows.prior.frames
     seen = [weight[start : start + length].sum() for start in windows.starts]
     order = np.argsort(seen)[::-1]
@@ -201,9 +201,9 @@ def _estimated(
 
 
 def _shared(heights: np.ndarray, spreads: np.ndarray) -> Height:
-    """Return the floor's height from those of windows; one alone tells others nothing.
+    """Return the weighted mean of the floor's height in windows, unknown from one alone.
 
-    With a wrong pitch, they differ with the distance, so that their variance counts too.
+    With a wrong pitch, heights depend on the distance, so that their variance counts too.
     """
     weights = spreads**-2 / (spreads**-2).sum()
     mean = float(weights @ heights)
