@@ -1,0 +1,44 @@
+import numpy as np
+import pytest
+
+from probmotion.lifting.camera import LevelCamera
+from probmotion.lifting.checks import Evidence, checked
+from probmotion.lifting.keypoints import ANKLES, PersonKeypoints
+
+FPS, DEPTH, FOCAL = 30.0, 8.0, 900.0
+FAST = 3.0  # of feet, metres per second
+
+
+def unsteadiness(x: np.ndarray, *, feet: float = FAST, noise: float = 0.01) -> float:
+    """Return the check of a body at x(t), metres, with feet of a speed and noise in pixels."""
+    rng, times = np.random.default_rng(0), np.arange(len(x)) / FPS
+    positions = np.zeros((len(x), 14, 3))
+    positions[..., 0], positions[..., 2] = x[:, None], -DEPTH
+    positions[:, ANKLES, 0] = feet * times[:, None]
+    points = 500 + FOCAL / DEPTH * positions[..., :2]
+    points += noise * rng.standard_normal(points.shape)
+    keypoints = PersonKeypoints(points, np.ones(points.shape[:2]), 0.0)
+    camera = LevelCamera(FOCAL, (500.0, 500.0))
+    checks = checked(Evidence(keypoints, FPS, camera, noise, positions, 0.0))
+    return {check.name: check.value for check in checks}["unsteady"]
+
+
+def test_people_may_run_and_change_their_speed_steadily():
+    times = np.arange(150) / FPS
+    assert unsteadiness(2 * times + 0.4 * times**2) == pytest.approx(0.0, abs=1e-3)
+    # Up to 3.6 m/s in three seconds, then down again.
+    speed = 1.2 * np.minimum(np.arange(180), 180 - np.arange(180)) / FPS
+    assert unsteadiness(np.cumsum(speed) / FPS) < 0.05
+
+
+def test_unsteadiness_is_the_median_deviation_of_velocities():
+    swing = 0.08 * np.sin(2 * np.pi * np.arange(900) / FPS)
+    # The median of a cosine's absolute value; velocities are mean ones of 2/15 s.
+    expected = 0.08 * 2 * np.pi * np.cos(np.pi / 4) * np.sinc(2 / 15)
+    assert unsteadiness(swing) == pytest.approx(expected, rel=0.1)
+    assert unsteadiness(swing, noise=4.0) == pytest.approx(expected, rel=0.3)
+    assert unsteadiness(swing, feet=0.0, noise=4.0) < 0.05
+
+
+def test_noise_alone_is_not_unsteady():
+    assert unsteadiness(np.zeros(900), noise=4.0) < 0.05
