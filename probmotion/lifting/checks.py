@@ -10,10 +10,9 @@ import numpy as np
 
 from probmotion.lifting.camera import LevelCamera
 from probmotion.lifting.keypoints import ANKLES, HIPS, PersonKeypoints, averaged
-from probmotion.lifting.window_fit import AGREED
 from probmotion.lifting.window_posterior import WindowSummary
 
-__all__ = ["MEDIAN", "Check", "Evidence", "checked", "unusual"]
+__all__ = ["MEDIAN", "Check", "Evidence", "checked", "uncertain"]
 
 MEDIAN = 1.66
 """Median of squared residuals of a keypoint under Student-t noise with 4 degrees of freedom."""
@@ -75,8 +74,7 @@ _LIMITS = {
         "the motion is more likely with left and right exchanged (is the video mirrored?)",
     ),
 }
-# Chosen likewise. Higher limits miss lifts with larger errors.
-_UNUSUAL = 2.75
+_UNCERTAIN = 0.12  # metres; chosen likewise
 
 
 def checked(evidence: Evidence) -> tuple[Check, ...]:
@@ -111,20 +109,20 @@ def checked(evidence: Evidence) -> tuple[Check, ...]:
     )
 
 
-def unusual(windows: Sequence[WindowSummary], disagreement: float) -> Check:
-    """Return the check of how unlike the clips the motion is, for one camera.
+def uncertain(windows: Sequence[WindowSummary]) -> Check:
+    """Return the check of how uncertain the joints' positions are, for one camera.
 
-    ``unusual``: mean square of standardised coefficients of the motion, median over windows, plus
-    the disagreement on depths between an image and its mirror image, metres, in units of
-    ``AGREED``. Either is large for animals and for people who crawl or roll.
+    ``uncertain``: standard deviation of the positions of visible joints about the hips, mean over
+    joints, median over windows, metres. It is large for motions unlike the clips, as of animals and
+    of people who crawl or roll, since intervals are widened for them.
     """
-    surprise = np.median([window.surprise for window in windows])
+    spreads = [window.spread for window in windows]
     return Check(
-        "unusual",
-        float(surprise + disagreement / AGREED),
-        _UNUSUAL,
-        "the motion is unlike the clips from which the prior was learnt (another animal, swapped "
-        "joints?)",
+        "uncertain",
+        float(np.nanmedian(spreads)),
+        _UNCERTAIN,
+        "positions of joints are known to more than 12 cm only, as the motion is unlike the clips "
+        "from which the prior was learnt (another animal, swapped joints?)",
     )
 
 

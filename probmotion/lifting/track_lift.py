@@ -12,7 +12,7 @@ import numpy as np
 from probmotion import seeds
 from probmotion.geometry.rotations import vector_to_matrix
 from probmotion.lifting.camera import LevelCamera
-from probmotion.lifting.checks import MEDIAN, Check, Evidence, checked, unusual
+from probmotion.lifting.checks import MEDIAN, Check, Evidence, checked, uncertain
 from probmotion.lifting.keypoints import (
     LIMBS,
     PERSON,
@@ -142,7 +142,7 @@ def lift_track(
     floor = float(np.median([summary.floor.mean for summary in summaries]))
     mirrored = other.score - estimate.score
     evidence = Evidence(keypoints, fps, found, level, mean, mirrored)
-    checks = (*checked(evidence), unusual(summaries, windows.disagreement()))
+    checks = (*checked(evidence), uncertain(summaries))
     if pitch is None:
         _tilt(chains, seed)
     return TrackLift(mean, chains, floor, found, level, checks)

@@ -42,10 +42,9 @@ from probmotion.lifting.window_posterior import (
 )
 from probmotion.lifting.window_prior import WindowPrior
 
-__all__ = ["AGREED", "Observed", "lift_window", "lift_window_views"]
+__all__ = ["Observed", "lift_window", "lift_window_views"]
 
-AGREED = 0.006
-"""Disagreement on depths of an image and its mirror image above which intervals widen, metres."""
+_AGREED = 0.006  # metres; intervals widen where an image and its mirror image disagree more
 _FREEDOM = 4.0  # degrees of freedom of the keypoints' noise
 _ROUNDS = 6  # of the linearisation
 _SCREENED = 40.0  # nats below the best component at which others are left out
@@ -159,7 +158,8 @@ def _posterior(
     modes = [_refined(prior, camera, seen, path, origin, k, yaw) for k, yaw in chosen]
     best = max(mode.score for mode in modes)
     kept = [mode for mode in modes if TEMPER * (mode.score - best) > np.log(_SMALL)]
-    return WindowPosterior(prior, origin, tuple(kept))
+    visible = (seen.weight > 0).reshape(-1, *seen.weight.shape[-2:]).any(axis=0)
+    return WindowPosterior(prior, origin, tuple(kept), visible)
 
 
 def _below(path: np.ndarray) -> np.ndarray:
@@ -296,7 +296,7 @@ def _inflation(several: bool, posture: float, disagreement: float) -> float:
     posture's standardised coefficients is above 1, and where the regression of depths disagrees
     with itself. Factors and powers were chosen on clips that prior and regression had not seen.
     """
-    unusual = min(max(1.0, disagreement / AGREED) ** 2, _WIDEST)
+    unusual = min(max(1.0, disagreement / _AGREED) ** 2, _WIDEST)
     return _INFLATION[several] * max(1.0, posture) ** 0.5 * unusual
 
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from probmotion.lifting.keypoints import HIPS, LIMBS
 from probmotion.lifting.window_prior import WindowPrior
 from probmotion.models.mixture.conditioning import rotation
 
@@ -24,6 +25,7 @@ TEMPER = 0.03
 Below 1, it makes them more even. Chosen on validation clips, because motion unlike the clips makes
 the exact posterior too narrow.
 """
+_EVERY = 4  # frames of a window of which one is used for its spread
 _JOIN_NOISE = 0.01  # standard deviation with which draws continue earlier ones, metres
 
 
@@ -89,27 +91,36 @@ class Height(NamedTuple):
 
 
 class WindowSummary(NamedTuple):
-    """Floor and usualness of the most probable mode of a window.
+    """Summary of the posterior of a window.
 
-    ``surprise`` and ``proportions`` are mean squares of standardised coefficients of the motion and
-    of bone lengths.
+    ``floor`` and ``proportions``, the mean square of standardised bone lengths, are those of the
+    most probable mode. ``spread`` is the mean standard deviation of visible joints relative to the
+    middle of the hips, metres; NaN if none is visible.
     """
 
     floor: Height
-    surprise: float
+    spread: float
     proportions: float
+
+
+def _about_hips(joints: np.ndarray) -> np.ndarray:
+    """Return joints of arms and legs relative to the middle of the hips, (T, J, …) → (T, 12, …)."""
+    relative: np.ndarray = joints[:, LIMBS] - joints[:, HIPS].mean(axis=1, keepdims=True)
+    return relative
 
 
 @dataclass(frozen=True, eq=False)
 class WindowPosterior:
     """Mixture of modes of one window.
 
-    Positions are relative to the camera, or in the world of several cameras, metres.
+    Positions are relative to the camera, or in the world of several cameras, metres. ``visible``,
+    (L, J), is whether a joint is visible in some view.
     """
 
     prior: WindowPrior
     origin: np.ndarray
     modes: tuple[WindowMode, ...]
+    visible: np.ndarray
 
     @property
     def probabilities(self) -> np.ndarray:
@@ -125,13 +136,29 @@ class WindowPosterior:
 
     @property
     def summary(self) -> WindowSummary:
-        """Floor and usualness of the most probable mode."""
+        """Floor, spread and proportions."""
         best, bones = self.best, len(self.prior.children)
         return WindowSummary(
-            self._floor(best),
-            float(best.scale * (best.mean[:-bones] ** 2).mean()),
-            float((best.mean[-bones:] ** 2).mean()),
+            self._floor(best), self._spread(), float((best.mean[-bones:] ** 2).mean())
         )
+
+    def _spread(self) -> float:
+        """Return the mean standard deviation of visible joints about the hips, metres."""
+        frames = np.arange(0, self.prior.frames, _EVERY)
+        shown = self.visible[frames][:, LIMBS]
+        if not shown.any():
+            return np.nan
+        first = second = np.zeros((len(frames), len(LIMBS), 3))  # moments
+        for p, mode in zip(self.probabilities, self.modes, strict=True):
+            gaussian = self._gaussian(mode)
+            at = gaussian.positions(self.prior, mode.component, mode.mean[None], frames)
+            design = gaussian.design(self.prior, frames).reshape(*at.shape[1:], -1)
+            mean, rows = _about_hips(at[0]), _about_hips(design)
+            half = solve_triangular(mode.lower, rows.reshape(mean.size, -1).T, lower=True)
+            variance = (mode.inflation * half).reshape(-1, *mean.shape) ** 2
+            first = first + p * mean
+            second = second + p * (mean**2 + variance.sum(axis=0))
+        return float(np.sqrt((second - first**2).sum(axis=-1))[shown].mean())
 
     def _floor(self, mode: WindowMode) -> Height:
         """Return the height of the floor, metres."""

@@ -180,7 +180,12 @@ def test_draws_have_focal_lengths_of_their_own_without_a_field_of_view(video, li
 
 @pytest.mark.parametrize(
     ("kind", "failed"),
-    [("random", "noise"), ("mirrored", "mirrored"), ("animal", "unusual"), ("moving", "unsteady")],
+    [
+        ("random", "noise"),
+        ("mirrored", "mirrored"),
+        ("animal", "uncertain"),
+        ("moving", "unsteady"),
+    ],
 )
 def test_keypoints_that_no_person_explains_are_flagged(video, kind, failed):
     track = video.track

@@ -49,6 +49,22 @@ def test_a_likely_motion_is_found(window_prior):
     assert posterior.summary.floor.mean == pytest.approx(-1.2, abs=0.06)
 
 
+def test_the_spread_is_that_of_draws_of_visible_joints(window_prior):
+    _, seen = observed(window_prior)
+    weight = seen.weight.copy()
+    weight[:, ANKLES] = 0
+    hidden = lift(window_prior, CAMERA, replace(seen, weight=weight), np.full(20, 4.3))
+    assert len(hidden.modes) > 1
+    drawn = hidden.sample(np.random.default_rng(0), 2000, np.arange(20.0))
+    about = drawn[:, :, LIMBS] - drawn[:, :, HIPS].mean(axis=2, keepdims=True)
+    sd = np.sqrt(about.var(axis=0).sum(axis=-1))
+    seen_sd = sd[:, ~np.isin(LIMBS, ANKLES)].mean()
+    assert hidden.summary.spread == pytest.approx(seen_sd, rel=0.03)
+    assert seen_sd < 0.9 * sd.mean()
+    nobody = lift(window_prior, CAMERA, replace(seen, weight=0 * weight), np.full(20, 4.3))
+    assert np.isnan(nobody.summary.spread)
+
+
 def test_outliers_do_not_move_the_motion(window_prior):
     _, seen = observed(window_prior)
     points = seen.points.copy()
