@@ -121,7 +121,7 @@ def uncertain(windows: Sequence[WindowSummary]) -> Check:
         "uncertain",
         float(np.nanmedian(spreads)),
         _UNCERTAIN,
-        "positions of joints are known to more than 12 cm only, as the motion is unlike the clips "
+        "positions of joints are uncertain by more than 12 cm, as the motion is unlike the clips "
         "from which the prior was learnt (another animal, swapped joints?)",
     )
 

@@ -25,7 +25,7 @@ TEMPER = 0.03
 Below 1, it makes them more even. Chosen on validation clips, because motion unlike the clips makes
 the exact posterior too narrow.
 """
-_EVERY = 4  # frames of a window of which one is used for its spread
+_EVERY = 4  # of the frames with visible joints, one is used for the spread
 _JOIN_NOISE = 0.01  # standard deviation with which draws continue earlier ones, metres
 
 
@@ -144,9 +144,9 @@ class WindowPosterior:
 
     def _spread(self) -> float:
         """Return the mean standard deviation of visible joints about the hips, metres."""
-        frames = np.arange(0, self.prior.frames, _EVERY)
-        shown = self.visible[frames][:, LIMBS]
-        if not shown.any():
+        shown = self.visible[:, LIMBS]
+        frames = np.flatnonzero(shown.any(axis=1))[::_EVERY]
+        if not len(frames):
             return np.nan
         first = second = np.zeros((len(frames), len(LIMBS), 3))  # moments
         for p, mode in zip(self.probabilities, self.modes, strict=True):
@@ -158,7 +158,7 @@ class WindowPosterior:
             variance = (mode.inflation * half).reshape(-1, *mean.shape) ** 2
             first = first + p * mean
             second = second + p * (mean**2 + variance.sum(axis=0))
-        return float(np.sqrt((second - first**2).sum(axis=-1))[shown].mean())
+        return float(np.sqrt((second - first**2).sum(axis=-1))[shown[frames]].mean())
 
     def _floor(self, mode: WindowMode) -> Height:
         """Return the height of the floor, metres."""
