@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -53,10 +54,8 @@ def usual_views(folder: Path, lifter_folder: Path | None = None) -> Iterator[tup
     baseline: dict[str, list[list[float]]] = {"walk": [], "other": []}
     flagged, standing = [], []
     for number, clip in enumerate(held_out(folder)):
-        for view in range(VIEWS):
-            # Heights alternate between azimuths, and between clips.
-            azimuth = (view + number) % VIEWS * 2 * np.pi / VIEWS
-            video = film(clip, number, azimuth=azimuth, height=HEIGHTS[view % 2])
+        for view, height in product(range(VIEWS), HEIGHTS):
+            video = film(clip, number, azimuth=view * 2 * np.pi / VIEWS, height=height)
             result = lifted(video)
             kind = "walk" if clip.name.startswith(GAITS) else "other"
             if kind == "walk":
@@ -64,7 +63,7 @@ def usual_views(folder: Path, lifter_folder: Path | None = None) -> Iterator[tup
             rows[kind].append(errors(result, video))
             if rows[kind][-1][0] <= GOOD:
                 flagged.append(not result.trusted)
-            compared[kind].append(beside_single_poses(result, video, HEIGHTS[view % 2]))
+            compared[kind].append(beside_single_poses(result, video, height))
             if lifter is not None:
                 truth = about_hips(video.motion.positions)
                 distances = np.linalg.norm(unsupervised(video, lifter) - truth, axis=-1)
