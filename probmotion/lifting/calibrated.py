@@ -47,6 +47,7 @@ _TRIED = 3  # windows on which size and noise are estimated
 _FITTED = 0.9  # share of the residuals that the fit leaves
 # Largest ratio of a joint's residuals to the noise in two, and in three or more views.
 _CONTRADICTIONS = (1.6, 2.4)
+_NOISE = 0.04  # largest noise of one view at the person's distance, metres
 _PROPORTIONS = 3.0  # largest mean square of standardised bone lengths
 _FEWEST, _SHARE = 10, 0.1  # frames in which a view shows the person
 
@@ -319,7 +320,7 @@ def _worst(evidence: Sequence[Evidence], proportions: float) -> tuple[Check, ...
         checks[0].name: max(checks, key=lambda check: check.value)
         for checks in zip(*map(checked, evidence), strict=True)
     }
-    limit = float(np.sqrt(views) * worst["noise"].limit)
+    limit = float(np.sqrt(views) * _NOISE)
     noise = replace(
         worst["noise"],
         limit=limit,

@@ -59,12 +59,11 @@ class Evidence(NamedTuple):
 
 
 _STEP, _LAG = 1 / 15, 2  # keypoints are averaged over _STEP seconds and compared _LAG steps apart
-_STEADY = 3.0  # seconds during which people who run have a constant acceleration
 _MEDIAN, _SMALLER = 0.674, 0.376  # of the absolute value of a standard normal, and of two of them
 _FEWEST, _SHARE = 10, 0.1  # visible frames of the joints whose residuals are checked
-# Chosen on lifts of clips that a prior and a network had not seen: no lift with an error below
-# 100 mm is above a limit if the motion is of a kind that they had seen. They had not seen running.
-# ``unsteady`` and ``mirrored`` have to be low enough for moving cameras and mirrored videos.
+# Chosen on lifts of clips that a prior and a network had not seen, so that none with an error below
+# 100 mm fails if other clips of its kind of motion had been fitted. ``unsteady`` and ``mirrored``
+# have to be low enough for moving cameras and mirrored videos.
 _LIMITS = {
     "noise": (0.06, "the keypoints' noise is more than 6 cm at the person's distance"),
     "residual": (2.6, "keypoints of a joint do not follow a body before a still camera"),
@@ -82,9 +81,9 @@ def checked(evidence: Evidence) -> tuple[Check, ...]:
 
     ``noise``: that of keypoints, in metres at the person's distance. ``residual``: largest ratio of
     a joint's robust residuals to the noise. ``unsteady``: the smaller of the slower ankle's speed
-    across the image and of the hips' deviation from a steady one, without what noise adds, metres
-    per second. ``mirrored``:
-    score of exchanged sides, minus that of the given.
+    across the image and of the hips' deviation from a velocity that changes linearly, both without
+    the contribution of the noise, metres per second. ``mirrored``: score of exchanged sides, minus
+    that of the given.
     """
     points, weight, _ = evidence.keypoints
     residual = np.linalg.norm(points - evidence.camera.pixels(evidence.mean), axis=-1)
@@ -112,17 +111,18 @@ def checked(evidence: Evidence) -> tuple[Check, ...]:
 def uncertain(windows: Sequence[WindowSummary]) -> Check:
     """Return the check of how uncertain the joints' positions are, for one camera.
 
-    ``uncertain``: standard deviation of the positions of visible joints about the hips, mean over
-    joints, median over windows, metres. It is large for motions unlike the clips, as of animals and
-    of people who crawl or roll, since intervals are widened for them.
+    ``uncertain``: standard deviation of visible joints relative to the hips, mean over joints,
+    median over windows, metres, for a person of 1.7 m and the estimated pitch. It is large for
+    motions unlike the clips, such as those of animals or of people who crawl, where standard
+    deviations are widened, and for people whose legs are hidden.
     """
     spreads = [window.spread for window in windows]
     return Check(
         "uncertain",
         float(np.nanmedian(spreads)),
         _UNCERTAIN,
-        "positions of joints are uncertain by more than 12 cm, as the motion is unlike the clips "
-        "from which the prior was learnt (another animal, swapped joints?)",
+        "joints have a standard deviation of more than 12 cm relative to the hips (hidden legs, "
+        "motion unlike that of the prior's clips, another animal, swapped joints?)",
     )
 
 
@@ -130,9 +130,10 @@ def _unsteadiness(evidence: Evidence) -> float:
     """Return how fast feet and body move to and fro across the image, metres per second.
 
     It is the smaller of the slower ankle's median speed and of the hips' median deviation from a
-    velocity that changes linearly for some seconds: of people before a still camera, a foot stands
-    still most of the time, or they run steadily. The squares of what the keypoints' noise alone
-    would cause are subtracted. Vertical velocities are not used, as people who jump have them too.
+    velocity that changes linearly: of people before a still camera, a foot stands still most of the
+    time, or they run steadily. The squares of what the keypoints' noise alone would cause are
+    subtracted, as if it were independent. Vertical velocities are not used, as people who jump have
+    them too.
     """
     step = max(1, round(evidence.fps * _STEP))
     points, weight, _ = averaged(evidence.keypoints, step)
@@ -147,19 +148,8 @@ def _unsteadiness(evidence: Evidence) -> float:
     velocity, sd, times = velocity[seen], sd[seen], np.flatnonzero(seen) * step / evidence.fps
     slower = np.median(np.abs(velocity[:, ANKLES]).min(axis=1))
     slower_noise = _SMALLER * np.median(sd[:, ANKLES])
-    hips = np.median(np.abs(_detrended(times, velocity[:, HIPS].mean(axis=1))))
+    hips, line = velocity[:, HIPS].mean(axis=1), np.stack([np.ones(len(times)), times], axis=1)
+    hips = np.median(np.abs(hips - line @ np.linalg.lstsq(line, hips)[0]))
     hips_noise = _MEDIAN * np.median(np.linalg.norm(sd[:, HIPS], axis=1) / len(HIPS))
     square = min(slower**2 - slower_noise**2, hips**2 - hips_noise**2)
     return float(np.sqrt(max(square, 0.0)))
-
-
-def _detrended(times: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the deviations from straight lines, one for each piece of about 3 s."""
-    pieces = max(1, round(times[-1] / _STEADY))
-    piece = np.minimum(times * pieces // max(times[-1], _STEP), pieces - 1)
-    out = np.empty(len(values))
-    for number in np.unique(piece):
-        rows = piece == number
-        line = np.stack([np.ones(rows.sum()), times[rows] - times[rows].mean()], axis=1)
-        out[rows] = values[rows] - line @ np.linalg.lstsq(line, values[rows])[0]
-    return out

@@ -195,7 +195,7 @@ def _estimated(
     modes = [posterior.best for posterior in found]
     squares = np.concatenate([mode.standardised[mode.standardised > 0] for mode in modes])
     noise = float(noise * np.sqrt(np.median(squares) / (MEDIAN * _FITTED)))
-    heights, spreads = np.array([posterior.summary.floor for posterior in found]).T
+    heights, spreads = np.array([posterior.floor for posterior in found]).T
     score = float(np.mean([mode.score for mode in modes]))
     return _Estimate(score, noise, pitch, _shared(heights, spreads))
 

@@ -135,12 +135,22 @@ class WindowPosterior:
         return max(self.modes, key=lambda mode: mode.score)
 
     @property
+    def floor(self) -> Height:
+        """Height of the floor in the most probable mode, metres."""
+        mode = self.best
+        place = len(self.prior.component(mode.component).variance)
+        unit = np.zeros(len(mode.mean))
+        unit[place] = FLOOR_SPREAD
+        half = solve_triangular(mode.lower, unit, lower=True)
+        height = self.origin[1] + FLOOR_SPREAD * mode.mean[place]
+        return Height(float(height), float(mode.inflation * np.sqrt(half @ half)))
+
+    @property
     def summary(self) -> WindowSummary:
         """Floor, spread and proportions."""
-        best, bones = self.best, len(self.prior.children)
-        return WindowSummary(
-            self._floor(best), self._spread(), float((best.mean[-bones:] ** 2).mean())
-        )
+        bones = len(self.prior.children)
+        proportions = float((self.best.mean[-bones:] ** 2).mean())
+        return WindowSummary(self.floor, self._spread(), proportions)
 
     def _spread(self) -> float:
         """Return the mean standard deviation of visible joints about the hips, metres."""
@@ -159,15 +169,6 @@ class WindowPosterior:
             first = first + p * mean
             second = second + p * (mean**2 + variance.sum(axis=0))
         return float(np.sqrt((second - first**2).sum(axis=-1))[shown[frames]].mean())
-
-    def _floor(self, mode: WindowMode) -> Height:
-        """Return the height of the floor, metres."""
-        place = len(self.prior.component(mode.component).variance)
-        unit = np.zeros(len(mode.mean))
-        unit[place] = FLOOR_SPREAD
-        half = solve_triangular(mode.lower, unit, lower=True)
-        height = self.origin[1] + FLOOR_SPREAD * mode.mean[place]
-        return Height(float(height), float(mode.inflation * np.sqrt(half @ half)))
 
     def mean(self, times: np.ndarray) -> np.ndarray:
         """Return the posterior mean at times in frames of the window, (T, J, 3)."""

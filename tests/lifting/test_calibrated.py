@@ -204,10 +204,11 @@ def test_views_that_contradict_each_other_are_flagged(filmed):
 
 def test_checks_of_several_views_have_limits_of_their_own(filmed, three):
     two = lifted(filmed, (0, 1), draws=2)
-    for result, residual in ((two, 1.6), (three, 2.4)):
+    for result, views, residual in ((two, 2, 1.6), (three, 3, 2.4)):
         limits = {check.name: check.limit for check in result.checks}
         assert list(limits) == ["noise", "residual", "proportions", "mirrored"]
         assert limits["residual"] == residual
+        assert limits["noise"] == pytest.approx(0.04 * np.sqrt(views))
         assert limits["mirrored"] == 0
         assert 0 < result.checks[2].value < limits["proportions"]
 

@@ -46,7 +46,7 @@ def test_a_likely_motion_is_found(window_prior):
     assert mean[:, 8, 2].mean() == pytest.approx(truth[:, 8, 2].mean(), rel=0.1)
     assert posterior.best.standardised.mean() < 2
     # The floor of the truth is 1.2 m below the camera.
-    assert posterior.summary.floor.mean == pytest.approx(-1.2, abs=0.06)
+    assert posterior.floor.mean == pytest.approx(-1.2, abs=0.06)
 
 
 def test_the_spread_is_that_of_draws_of_visible_joints(window_prior):
@@ -199,7 +199,7 @@ def test_a_known_floor_counts_by_its_standard_deviation(window_prior):
 
     def floor(height: Height | None) -> Height:
         known = replace(seen, floor=height)
-        return lift(window_prior, CAMERA, known, np.full(20, 4.3)).summary.floor
+        return lift(window_prior, CAMERA, known, np.full(20, 4.3)).floor
 
     alone, exact = floor(None), floor(Height(-1.1, 1e-4))
     assert exact.mean == pytest.approx(-1.1, abs=1e-3)
