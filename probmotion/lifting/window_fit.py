@@ -158,7 +158,7 @@ def _posterior(
     modes = [_refined(prior, camera, seen, path, origin, k, yaw) for k, yaw in chosen]
     best = max(mode.score for mode in modes)
     kept = [mode for mode in modes if TEMPER * (mode.score - best) > np.log(_SMALL)]
-    visible: np.ndarray = (seen.weight > 0).reshape(-1, *seen.weight.shape[-2:]).any(axis=0)
+    visible = seen.weight.reshape(-1, *seen.weight.shape[-2:]).max(axis=0) > 0
     return WindowPosterior(prior, origin, tuple(kept), visible)
 
 
