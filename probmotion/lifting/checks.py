@@ -59,7 +59,8 @@ class Evidence(NamedTuple):
 
 
 _STEP, _LAG = 1 / 15, 2  # keypoints are averaged over _STEP seconds and compared _LAG steps apart
-_MEDIAN, _SMALLER = 0.674, 0.376  # of the absolute value of a standard normal, and of two of them
+# Medians of the absolute value of a standard normal, and of the smaller one of two of them.
+_ONE, _TWO = 0.674, 0.376
 _FEWEST, _SHARE = 10, 0.1  # visible frames of the joints whose residuals are checked
 # Chosen on lifts of clips that a prior and a network had not seen, so that none with an error below
 # 100 mm fails if other clips of its kind of motion had been fitted. ``unsteady`` and ``mirrored``
@@ -147,9 +148,9 @@ def _unsteadiness(evidence: Evidence) -> float:
         sd = evidence.noise * scale * np.sqrt(1 / weight[_LAG:] + 1 / weight[:-_LAG])
     velocity, sd, times = velocity[seen], sd[seen], np.flatnonzero(seen) * step / evidence.fps
     slower = np.median(np.abs(velocity[:, ANKLES]).min(axis=1))
-    slower_noise = _SMALLER * np.median(sd[:, ANKLES])
+    slower_noise = _TWO * np.median(sd[:, ANKLES])
     hips, line = velocity[:, HIPS].mean(axis=1), np.stack([np.ones(len(times)), times], axis=1)
     hips = np.median(np.abs(hips - line @ np.linalg.lstsq(line, hips)[0]))
-    hips_noise = _MEDIAN * np.median(np.linalg.norm(sd[:, HIPS], axis=1) / len(HIPS))
+    hips_noise = _ONE * np.median(np.linalg.norm(sd[:, HIPS], axis=1) / len(HIPS))
     square = min(slower**2 - slower_noise**2, hips**2 - hips_noise**2)
     return float(np.sqrt(max(square, 0.0)))

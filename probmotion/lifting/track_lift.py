@@ -75,7 +75,7 @@ class _Windows(NamedTuple):
         observed = Observed(seen, weight, noise, depths, floor)
         return lift_window(self.prior, camera, observed, middle, depth, candidates=candidates)
 
-    def disagreement(self, rows: slice = slice(None)) -> float:
+    def disagreement(self, rows: slice) -> float:
         """Return how far an image and its mirror image disagree on depths, median, metres."""
         shown = self.keypoints.weight[rows][:, LIMBS] > 0
         differences = self.depths.disagreement[rows][shown]

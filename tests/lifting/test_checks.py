@@ -9,15 +9,17 @@ FPS, DEPTH, FOCAL = 30.0, 8.0, 900.0
 FAST = 3.0  # of feet, metres per second
 
 
-def unsteadiness(x: np.ndarray, *, feet: float = FAST, noise: float = 0.01) -> float:
+def unsteadiness(
+    x: np.ndarray, *, feet: float = FAST, noise: float = 0.01, weight: float = 1.0
+) -> float:
     """Return the check of a body at x(t), metres, with feet of a speed and noise in pixels."""
     rng, times = np.random.default_rng(0), np.arange(len(x)) / FPS
     positions = np.zeros((len(x), 14, 3))
     positions[..., 0], positions[..., 2] = x[:, None], -DEPTH
     positions[:, ANKLES, 0] = feet * times[:, None]
     points = 500 + FOCAL / DEPTH * positions[..., :2]
-    points += noise * rng.standard_normal(points.shape)
-    keypoints = PersonKeypoints(points, np.ones(points.shape[:2]), 0.0)
+    points += noise / np.sqrt(weight) * rng.standard_normal(points.shape)
+    keypoints = PersonKeypoints(points, np.full(points.shape[:2], weight), 0.0)
     camera = LevelCamera(FOCAL, (500.0, 500.0))
     checks = checked(Evidence(keypoints, FPS, camera, noise, positions, 0.0))
     return {check.name: check.value for check in checks}["unsteady"]
@@ -39,3 +41,4 @@ def test_unsteadiness_is_the_median_deviation_of_velocities():
 
 def test_noise_alone_is_not_unsteady():
     assert unsteadiness(np.zeros(900), noise=4.0) < 0.05
+    assert unsteadiness(np.zeros(900), noise=2.0, weight=0.25) < 0.05
