@@ -57,8 +57,9 @@ def lift(
     ``cmu-motion``. Means are averaged with weights that fall linearly to 0 at a window's ends; each
     draw continues from the previous window's. The depths of joints and the pitch of an uncalibrated
     camera are estimated by ``pose-depth`` (:mod:`probmotion.models.unseen_depth.pose_depth`), the
-    noise of the keypoints, and the floor's height with one camera, in three windows. Feet that
-    stand on the floor are held (:mod:`probmotion.lifting.linear_system`).
+    noise of the keypoints, and the floor's height with one camera, in three windows, whose floors
+    also correct the pitch where the person's distance changes. Feet that stand on the floor are
+    held (:mod:`probmotion.lifting.linear_system`).
 
     Draws of an uncalibrated camera have pitches, focal lengths and sizes of their own, drawn
     independently of the path: the paths are approximate, and cameras differ in height.

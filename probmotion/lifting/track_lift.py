@@ -33,7 +33,7 @@ from probmotion.threads import one_thread
 
 __all__ = ["TrackLift", "lift_track"]
 
-_PITCH_ERROR = np.radians(3.5)  # standard deviation of draws' pitches about the estimate
+_PITCH_ERROR = np.radians(3.5)  # standard deviation of the network's pitch
 _DEPENDENT = 1.4  # factor of the estimated depths' sd: frames' errors are correlated
 _CANDIDATES = 5  # of a window whose noise, score and floor are estimated
 _TRIED = 3  # windows on which they are estimated
@@ -119,7 +119,7 @@ def lift_track(
     """Return what one camera tells about a motion.
 
     The ``pitch``, radians, and the ``noise``, pixels, are estimated if they are None: the pitch by
-    the regression of depths, the noise from a first ``guess``.
+    the regression of depths and from the floor, the noise from a first ``guess``.
     """
     with one_thread():
         windows = _windows(keypoints, fps)
@@ -144,7 +144,7 @@ def lift_track(
     evidence = Evidence(keypoints, fps, found, level, mean, mirrored)
     checks = (*checked(evidence), uncertain(summaries))
     if pitch is None:
-        _tilt(chains, seed)
+        _tilt(chains, estimate.pitch_spread, seed)
     return TrackLift(mean, chains, floor, found, level, checks)
 
 
@@ -169,25 +169,29 @@ def _depths(keypoints: PersonKeypoints, path: BodyPath, fps: float) -> DepthEsti
 
 
 class _Estimate(NamedTuple):
-    """Mean score of windows, noise (pixels), pitch (radians) and the floor's height."""
+    """Mean score of windows, noise (pixels), pitch and its sd (radians), and the floor's height."""
 
     score: float
     noise: float
     pitch: float
+    pitch_spread: float
     floor: Height
 
 
 def _estimated(
     windows: _Windows, camera: LevelCamera, noise: float, pitch: float | None
 ) -> _Estimate:
-    """Return the estimates of some windows; the pitch is the network's if it is None."""
+    """Return the estimates of some windows.
+
+    If the pitch is None, it is the network's, corrected so that the windows' floors agree.
+    """
     weight, length = windows.keypoints.weight, windows.prior.frames
     seen = [weight[start : start + length].sum() for start in windows.starts]
     order = np.argsort(seen)[::-1]
     chosen = [windows.starts[i] for i in np.sort(order[: max(_TRIED, len(order) // 2)])]
     chosen = [chosen[i] for i in np.linspace(0, len(chosen) - 1, _TRIED).round().astype(int)]
-    pitch = _pitch(windows, camera) if pitch is None else pitch
-    tilted = replace(camera, pitch=pitch)
+    first = _pitch(windows, camera) if pitch is None else pitch
+    tilted = replace(camera, pitch=first)
     found = [
         windows.posterior(start, tilted, noise, candidates=_CANDIDATES)
         for start in sorted(set(chosen))
@@ -197,13 +201,29 @@ def _estimated(
     noise = float(noise * np.sqrt(np.median(squares) / (MEDIAN * _FITTED)))
     heights, spreads = np.array([posterior.floor for posterior in found]).T
     score = float(np.mean([mode.score for mode in modes]))
-    return _Estimate(score, noise, pitch, _shared(heights, spreads))
+    if pitch is not None:
+        return _Estimate(score, noise, pitch, 0.0, _shared(heights, spreads))
+    distances = np.array([-mode.positions[..., 2].mean() for mode in modes])
+    slope, spread = _slope(heights, spreads, distances)
+    level = _shared(heights - slope * distances, spreads)
+    return _Estimate(score, noise, first - slope, spread, level)
+
+
+def _slope(heights: np.ndarray, spreads: np.ndarray, distances: np.ndarray) -> tuple[float, float]:
+    """Return by how much the windows' floors rise with the distance, and its sd.
+
+    The floor is level: the slope is the error of the pitch, about 0 ± 3.5°.
+    """
+    weights = 1 / (spreads**2 + _UNEVEN**2)
+    beyond = distances - np.average(distances, weights=weights)
+    precision = weights @ beyond**2 + _PITCH_ERROR**-2
+    return float((weights * beyond) @ heights / precision), float(precision**-0.5)
 
 
 def _shared(heights: np.ndarray, spreads: np.ndarray) -> Height:
     """Return the weighted mean of the floor's height in windows, unknown from one alone.
 
-    With a wrong pitch, heights depend on the distance, so that their variance counts too.
+    Their variance counts too: heights still depend on the distance if the pitch is wrong.
     """
     weights = spreads**-2 / (spreads**-2).sum()
     mean = float(weights @ heights)
@@ -224,12 +244,12 @@ def _pitch(windows: _Windows, camera: LevelCamera) -> float:
     return float(np.average(pitches, weights=spread**-2))
 
 
-def _tilt(draws: np.ndarray, seed: int) -> None:
+def _tilt(draws: np.ndarray, spread: float, seed: int) -> None:
     """Turn the draws about the camera, each to a pitch of its own.
 
     The pelvis keeps its height, as the floor is level.
     """
-    turn = _PITCH_ERROR * seeds.generator(seed, "lift: pitch").standard_normal(len(draws))
+    turn = spread * seeds.generator(seed, "lift: pitch").standard_normal(len(draws))
     matrices = vector_to_matrix(turn[:, None] * [1.0, 0.0, 0.0])
     for draw, matrix in zip(draws, matrices, strict=True):
         height = draw[:, :1, 1].copy()
