@@ -23,6 +23,7 @@ __all__ = [
     "LOCK",
     "UNSEALED",
     "check_format",
+    "check_writable",
     "forget_killed",
     "locked_folder",
     "member_array",
@@ -136,6 +137,14 @@ def writable_folder(folder: Path, name: str = "out") -> Path:
         reason = error.strerror or str(error)
         raise OSError(f"{name} must be a writable folder, got {str(folder)!r}: {reason}") from error
     return folder
+
+
+def check_writable(folder: Path) -> None:
+    """Raise ``OSError`` if the folder ``out`` is not writable; leave nothing behind."""
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    writable_folder(folder)
+    for path in missing:
+        path.rmdir()
 
 
 @contextmanager

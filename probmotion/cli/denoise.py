@@ -55,7 +55,7 @@ class Denoise(Conventions):
     """Seed of the draws."""
 
     def run(self) -> None:
-        from probmotion.files import writable_folder
+        from probmotion.files import check_writable
         from probmotion.io.errors import errors_in
         from probmotion.io.files import read_joints
         from probmotion.models.mixture.denoising import denoise_joints
@@ -74,7 +74,7 @@ class Denoise(Conventions):
         track = read_joints(self.file, **self.conventions())
         with errors_in(self.file):
             track = track.retarget(Skeleton.preset("person14"))
-        writable_folder(self.out)
+        check_writable(self.out)
         corrector = None
         if self.correct:
             from probmotion.problems.joint_correction import correct_joints, shipped_corrector
@@ -103,10 +103,12 @@ class Denoise(Conventions):
 
 def _write(track: JointTrack, result: Any, out: Path) -> None:
     """Write ``denoised.npz`` and ``mean.bvh``."""
+    from probmotion.files import writable_folder
     from probmotion.io.bvh_writing import write_bvh
     from probmotion.io.npz import write_npz
     from probmotion.motion.motion import Motion
 
+    writable_folder(out)
     mean = Motion(result.mean, track.skeleton, track.fps, name=track.name)
     posterior = {"sd": result.sd, "draws": result.draws, "noise": result.noise}
     write_npz(mean, out / "denoised.npz", posterior)

@@ -72,7 +72,7 @@ class Lift:
     """Fail (exit status 2) if a motion does not pass all checks."""
 
     def run(self) -> None:
-        from probmotion.files import writable_folder
+        from probmotion.files import check_writable
         from probmotion.lifting.recording_lift import lift
 
         if self.image_size is None and self.camera is None:
@@ -81,7 +81,7 @@ class Lift:
                 "video of this width and height"
             )
         people = self._people()
-        writable_folder(self.out)
+        check_writable(self.out)
         doubtful, refused = [], []
         for number, tracks in enumerate(people):
             folder = self.out if len(people) == 1 else self.out / f"person-{number}"
@@ -193,7 +193,7 @@ class Reconstruct:
     """Seed of the draws."""
 
     def run(self) -> None:
-        from probmotion.files import writable_folder
+        from probmotion.files import check_writable
         from probmotion.models.images.category import Category
         from probmotion.models.images.observation import ImageObservation
         from probmotion.reconstruction.inference import reconstruct
@@ -210,7 +210,7 @@ class Reconstruct:
         )
         category.check_features(observation.features)
         category.check_images(observation.images)
-        writable_folder(self.out)
+        check_writable(self.out)
         result = reconstruct(observation, category, draws=self.draws, seed=self.seed)
         result.save(self.out)
         print("\n".join(result.summary()))

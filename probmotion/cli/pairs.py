@@ -59,7 +59,7 @@ class Pairs:
 
     def run(self) -> None:
         from probmotion.data.pairs import pair_motion
-        from probmotion.files import writable_folder
+        from probmotion.files import check_writable
         from probmotion.io.files import load
         from probmotion.lifting.pairs import lift_pairs
 
@@ -68,7 +68,7 @@ class Pairs:
         motions = [load(path) for path in self.seed]
         start = motions[0] if len(motions) == 1 else pair_motion(motions[0], motions[1])
         tracks = self._tracks()
-        writable_folder(self.out)
+        check_writable(self.out)
         result = lift_pairs(tracks, start, swap_people=self.swap_people, draws=self.draws)
         result.save(self.out)
         print("\n".join(result.summary()))

@@ -48,7 +48,10 @@ def read_keypoints(
     """
     file = open_keypoints(path, fps, skeleton, people, image_size)
     if file.fps is None:
-        raise ValueError(f"fps must be given for {path}, which contains no frame rate, got None")
+        raise ValueError(
+            f"fps must be given for {path}, which contains no frame rate, got None; give the "
+            "video's (fps=30, --fps 30)"
+        )
     return file.tracks
 
 

@@ -76,7 +76,11 @@ def _layout(detections: list[Detection], given: Skeleton | None, path: Path) -> 
             return Skeleton.preset(layout)
         if count not in _BY_COUNT:
             wanted = f"{count} keypoints{_TWO_LAYOUTS.get(count, '')}"
-            raise MotionFileError(f"{path}: skeleton must be given for {wanted}, got None")
+            known = ", ".join(f"{number} ({name})" for number, name in _BY_COUNT.items())
+            raise MotionFileError(
+                f"{path}: skeleton must be given for {wanted}, got None; recognised numbers are "
+                f"{known}, 25 (body25, body25b), 133 and 136"
+            )
         return Skeleton.preset(_BY_COUNT[count])
     if given.n_joints != count:
         raise MotionFileError(

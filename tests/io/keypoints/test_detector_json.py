@@ -302,7 +302,10 @@ def category(**more):
         ([ONE | {"keypoints": [1, 2, -1]}], "expected confidence of at least 0, got -1"),
         ([ONE | {"keypoints": [1, 2, 95] * 17}], "confidence must be 0 to 2, got 95"),
         ([ONE | {"keypoints": [float("nan"), 2, 1]}], "where confidence is above 0, got NaN"),
-        ([ONE | {"keypoints": [1, 2, 1] * 5}], "skeleton must be given for 5 keypoints, got None"),
+        (
+            [ONE | {"keypoints": [1, 2, 1] * 5}],
+            "for 5 keypoints, got None; recognised .* 17 .coco17., 18 .openpose18., ",
+        ),
         ([ONE, result(1, FIRST[0][:5])], r"the same number of keypoints, got \[5, 17\]"),
         ({"people": []}, "expected at least one person, got none"),
         (coco(images=None), "images must be a list of objects, got None"),
