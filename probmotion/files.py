@@ -140,11 +140,14 @@ def writable_folder(folder: Path, name: str = "out") -> Path:
 
 
 def check_writable(folder: Path) -> None:
-    """Raise ``OSError`` if the folder ``out`` is not writable; leave nothing behind."""
-    missing = [path for path in (folder, *folder.parents) if not path.exists()]
-    writable_folder(folder)
-    for path in missing:
-        path.rmdir()
+    """Raise ``OSError`` if the folder ``out`` is not writable; delete what this creates."""
+    missing = [path for path in (folder, *folder.parents) if not os.path.exists(path)]
+    try:
+        writable_folder(folder)
+    finally:
+        for path in missing:
+            with suppress(OSError):  # another process may use it
+                path.rmdir()
 
 
 @contextmanager

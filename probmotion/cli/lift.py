@@ -52,8 +52,8 @@ class Lift:
     """Index of the person to lift; all by default."""
 
     fov: Annotated[float | None, arg(metavar="DEGREES", help_behavior_hint="")] = None
-    """Horizontal field of view, degrees: distances from the camera depend on it. By default 60
-    along the longer side, and 39 to 87 for 90 % of the draws."""
+    """Horizontal field of view, degrees: distances from the camera depend on it. By default about
+    60 along the longer side, at most 39 to 87 for 90 % of the draws."""
 
     pitch: Annotated[float | None, arg(metavar="DEGREES", help_behavior_hint="")] = None
     """Angle of the camera above the horizon, degrees, negative if it looks down. Estimated by

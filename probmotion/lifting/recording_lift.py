@@ -30,7 +30,7 @@ __all__ = ["lift"]
 
 _SLOWEST = 5.0  # frame rate
 _FOV = 60.0  # median field of view along the longer side, degrees
-_FOCAL_SPREAD = 0.3  # of the logarithm of the focal length: 90 % of fields of view are 39° to 87°
+_FOCAL_ERROR = 0.3  # of the logarithm of the focal length: 90 % of fields of view are 39° to 87°
 _HEIGHT, _HEIGHT_SPREAD = 1.7, 0.06  # of adults: mean, metres, and relative standard deviation
 _MEASURED = 0.01  # relative standard deviation of a given height
 _LEVEL = 0.05  # standard deviation of the floor about 0 of a calibration, metres
@@ -57,9 +57,10 @@ def lift(
     ``cmu-motion``. Means are averaged with weights that fall linearly to 0 at a window's ends; each
     draw continues from the previous window's. The depths of joints and the pitch of an uncalibrated
     camera are estimated by ``pose-depth`` (:mod:`probmotion.models.unseen_depth.pose_depth`), the
-    noise of the keypoints, and the floor's height with one camera, in three windows, whose floors
-    also correct the pitch where the person's distance changes. Feet that stand on the floor are
-    held (:mod:`probmotion.lifting.linear_system`).
+    noise of the keypoints, and the floor's height with one camera, in three windows. Their floors
+    are level: where the person's distance changes, they correct the pitch, and the focal length of
+    a camera that looks up or down. Feet that stand on the floor are held
+    (:mod:`probmotion.lifting.linear_system`).
 
     Draws of an uncalibrated camera have pitches, focal lengths and sizes of their own, drawn
     independently of the path: the paths are approximate, and cameras differ in height.
@@ -79,7 +80,8 @@ def lift(
     fov : float, optional
         Horizontal field of view, degrees. Distances from the camera are proportional to the focal
         length, which one still view hardly determines: by default, it is 60° along the image's
-        longer side, and each draw has its own (90 % are 39° to 87°).
+        longer side (90 % interval: 39° to 87°) if the floor does not tell more, and each draw has
+        its own.
     pitch : float, optional
         Angle of the camera above the horizon, degrees, negative if it looks down; estimated by
         default.
@@ -155,6 +157,7 @@ class _Settings(NamedTuple):
         fps: float,
         camera: LevelCamera,
         pitch: float | None,
+        focal_error: float,
         guess: float,
     ) -> TrackLift:
         """Return the lift of one camera's keypoints."""
@@ -163,6 +166,7 @@ class _Settings(NamedTuple):
             fps,
             camera,
             pitch,
+            focal_error,
             self.noise,
             guess,
             draws=self.draws,
@@ -191,13 +195,14 @@ def _before_camera(
     focal = 0.5 * side / np.tan(np.radians(fov or _FOV) / 2)
     camera = LevelCamera(focal, (image_size[0] / 2, image_size[1] / 2))
     known = None if pitch is None else float(np.radians(pitch))
-    seen = settings.lift(keypoints, track.fps, camera, known, _NOISE * max(image_size))
+    error = _FOCAL_ERROR if fov is None else 0.0
+    seen = settings.lift(keypoints, track.fps, camera, known, error, _NOISE * max(image_size))
     draws = seen.draws  # large: changed in place
     if fov is None:
         # The image of a body is nearly the same at r times the distance for r times the focal
         # length. Keypoints hardly tell them apart.
         rng = seeds.generator(settings.seed, "lift: focal length")
-        ratio = np.exp(_FOCAL_SPREAD * rng.standard_normal((settings.draws, 1, 1)))
+        ratio = np.exp(seen.focal_error * rng.standard_normal((settings.draws, 1, 1)))
         draws[..., 2] += (ratio - 1) * draws[:, :, :1, 2]
     scale, spread = settings.size
     # Size, distance and the camera's height are proportional.
@@ -266,7 +271,7 @@ def _in_calibration(
 def _placed(view: CalibratedView, fps: float, guess: float, settings: _Settings) -> LiftedViews:
     """Return the posterior given one calibrated camera above a known floor."""
     camera = LevelCamera(view.camera.focal, view.camera.centre)
-    seen = settings.lift(view.keypoints, fps, camera, view.camera.pitch, guess)
+    seen = settings.lift(view.keypoints, fps, camera, view.camera.pitch, 0.0, guess)
     scale, spread = settings.size
     # The height of the camera in units of the body's size tells the size.
     height = view.camera.position[1]

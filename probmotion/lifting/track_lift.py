@@ -39,6 +39,7 @@ _CANDIDATES = 5  # of a window whose noise, score and floor are estimated
 _TRIED = 3  # windows on which they are estimated
 _FITTED = 0.8  # share of the residuals that the fit leaves
 _UNEVEN = 0.02  # smallest standard deviation of the floor, metres
+_STEEP = 2.5  # standard deviations; floors that rise more are steps or a slope
 
 
 class _Windows(NamedTuple):
@@ -93,13 +94,15 @@ class _Windows(NamedTuple):
 class TrackLift(NamedTuple):
     """Mean and draws relative to the camera for a person of 1.7 m, and what was estimated.
 
-    ``floor`` is the height of the floor relative to the camera.
+    ``floor`` is the height of the floor relative to the camera, ``focal_error`` the standard
+    deviation of the logarithm of the camera's focal length.
     """
 
     mean: np.ndarray
     draws: np.ndarray
     floor: float
     camera: LevelCamera
+    focal_error: float
     noise: float
     checks: tuple[Check, ...]
 
@@ -109,6 +112,7 @@ def lift_track(
     fps: float,
     camera: LevelCamera,
     pitch: float | None,
+    focal_error: float,
     noise: float | None,
     guess: float,
     *,
@@ -119,17 +123,19 @@ def lift_track(
     """Return what one camera tells about a motion.
 
     The ``pitch``, radians, and the ``noise``, pixels, are estimated if they are None: the pitch by
-    the regression of depths and from the floor, the noise from a first ``guess``.
+    the regression of depths, the noise from a first ``guess``. The floor is level: what windows
+    tell about it corrects that pitch, and the focal length, whose logarithm has the standard
+    deviation ``focal_error``.
     """
     with one_thread():
         windows = _windows(keypoints, fps)
     with one_thread(), progress_bar(len(windows.starts), "lift", progress) as bar:
         with ThreadPoolExecutor(2) as pool:
             estimate, other = pool.map(
-                lambda each: _estimated(each, camera, noise or guess, pitch),
+                lambda each: _estimated(each, camera, noise or guess, pitch, focal_error),
                 (windows, windows.mirrored()),
             )
-        level, found = noise or estimate.noise, replace(camera, pitch=estimate.pitch)
+        level, found = noise or estimate.noise, estimate.camera
         mean, chains, summaries = stitched(
             lambda start: windows.posterior(start, found, level, floor=estimate.floor),
             windows.starts,
@@ -144,8 +150,8 @@ def lift_track(
     evidence = Evidence(keypoints, fps, found, level, mean, mirrored)
     checks = (*checked(evidence), uncertain(summaries))
     if pitch is None:
-        _tilt(chains, estimate.pitch_spread, seed)
-    return TrackLift(mean, chains, floor, found, level, checks)
+        _tilt(chains, estimate.error.pitch, seed)
+    return TrackLift(mean, chains, floor, found, estimate.error.focal, level, checks)
 
 
 def _windows(keypoints: PersonKeypoints, fps: float) -> _Windows:
@@ -168,30 +174,38 @@ def _depths(keypoints: PersonKeypoints, path: BodyPath, fps: float) -> DepthEsti
     return _regression().estimate(points, visible, path.middle, path.size, fps)
 
 
+class _CameraError(NamedTuple):
+    """Standard deviations of the pitch, radians, and of the logarithm of the focal length."""
+
+    pitch: float
+    focal: float
+
+
 class _Estimate(NamedTuple):
-    """Mean score of windows, noise (pixels), pitch and its sd (radians), and the floor's height."""
+    """Mean score of windows, noise (pixels), camera, its errors, and the floor's height."""
 
     score: float
     noise: float
-    pitch: float
-    pitch_spread: float
+    camera: LevelCamera
+    error: _CameraError
     floor: Height
 
 
 def _estimated(
-    windows: _Windows, camera: LevelCamera, noise: float, pitch: float | None
+    windows: _Windows,
+    camera: LevelCamera,
+    noise: float,
+    pitch: float | None,
+    focal_error: float,
 ) -> _Estimate:
-    """Return the estimates of some windows.
-
-    If the pitch is None, it is the network's, corrected so that the windows' floors agree.
-    """
+    """Return the estimates of some windows; the first pitch is the network's if it is None."""
     weight, length = windows.keypoints.weight, windows.prior.frames
     seen = [weight[start : start + length].sum() for start in windows.starts]
     order = np.argsort(seen)[::-1]
     chosen = [windows.starts[i] for i in np.sort(order[: max(_TRIED, len(order) // 2)])]
     chosen = [chosen[i] for i in np.linspace(0, len(chosen) - 1, _TRIED).round().astype(int)]
-    first = _pitch(windows, camera) if pitch is None else pitch
-    tilted = replace(camera, pitch=first)
+    error = _CameraError(_PITCH_ERROR if pitch is None else 0.0, focal_error)
+    tilted = replace(camera, pitch=_pitch(windows, camera) if pitch is None else pitch)
     found = [
         windows.posterior(start, tilted, noise, candidates=_CANDIDATES)
         for start in sorted(set(chosen))
@@ -201,23 +215,37 @@ def _estimated(
     noise = float(noise * np.sqrt(np.median(squares) / (MEDIAN * _FITTED)))
     heights, spreads = np.array([posterior.floor for posterior in found]).T
     score = float(np.mean([mode.score for mode in modes]))
-    if pitch is not None:
-        return _Estimate(score, noise, pitch, 0.0, _shared(heights, spreads))
     distances = np.array([-mode.positions[..., 2].mean() for mode in modes])
-    slope, spread = _slope(heights, spreads, distances)
-    level = _shared(heights - slope * distances, spreads)
-    return _Estimate(score, noise, first - slope, spread, level)
+    return _Estimate(score, noise, *_levelled(tilted, error, heights, spreads, distances))
 
 
-def _slope(heights: np.ndarray, spreads: np.ndarray, distances: np.ndarray) -> tuple[float, float]:
-    """Return by how much the windows' floors rise with the distance, and its sd.
+def _levelled(
+    camera: LevelCamera,
+    error: _CameraError,
+    heights: np.ndarray,
+    spreads: np.ndarray,
+    distances: np.ndarray,
+) -> tuple[LevelCamera, _CameraError, Height]:
+    """Return the camera before which the floors of windows are level, its errors, and the floor.
 
-    The floor is level: the slope is the error of the pitch, about 0 ± 3.5°.
+    If the pitch p is too large by δ, and the logarithm of the focal length too small by ρ, a level
+    floor seems to rise with the distance by δ − ρ tan p.
     """
+    scales = np.array(error)
+    effects = scales * [1.0, -np.tan(camera.pitch)]
     weights = 1 / (spreads**2 + _UNEVEN**2)
     beyond = distances - np.average(distances, weights=weights)
-    precision = weights @ beyond**2 + _PITCH_ERROR**-2
-    return float((weights * beyond) @ heights / precision), float(precision**-0.5)
+    covariance = np.linalg.inv(np.eye(2) + (weights @ beyond**2) * np.outer(effects, effects))
+    mean = covariance @ effects * ((weights * beyond) @ heights)
+    if abs(effects @ mean) > _STEEP * np.linalg.norm(effects):
+        mean, covariance = np.zeros(2), np.eye(2)
+    level = _shared(heights - (effects @ mean) * distances, spreads)
+    pitch, focal = scales * mean
+    found = replace(
+        camera, pitch=float(camera.pitch - pitch), focal=float(camera.focal * np.exp(focal))
+    )
+    left = scales * np.sqrt(np.diag(covariance))
+    return found, _CameraError(float(left[0]), float(left[1])), level
 
 
 def _shared(heights: np.ndarray, spreads: np.ndarray) -> Height:

@@ -155,7 +155,6 @@ def test_invalid_input_is_one_sentence(calls, fails, tmp_path):
     assert "joints must include left_wrist, right_wrist" in message
     path.write_bytes(b"")
     assert "expected an npz archive" in fails("denoise", path, *out)
-    assert not (tmp_path / "out").exists()
     (tmp_path / "out").write_text("")
     record(path)
     assert "out must be a writable folder" in fails("denoise", path, *out)

@@ -7,6 +7,7 @@ from probmotion.data.synthetic.gaits import make_gait
 from probmotion.data.videos import film, quadruped_as_person
 from probmotion.geometry.rotations import vector_to_matrix
 from probmotion.lifting import lift, track_lift
+from probmotion.lifting.camera import LevelCamera
 from probmotion.lifting.keypoints import LIMBS, PERSON, person_keypoints
 from probmotion.lifting.track_lift import _windows
 
@@ -155,10 +156,20 @@ def test_taller_people_are_farther_away(video, lifted):
     assert not np.allclose(usual.draws, lifted.draws[:2], rtol=0.01)
 
 
-def test_draws_have_pitches_of_their_own_where_it_is_estimated(monkeypatch, video):
-    monkeypatch.setattr(track_lift, "_slope", lambda *_: (0.0, np.radians(1.0)))
-    lifted = lift(video.track, image_size=video.size, progress=False, draws=40)
-    pitch = float(np.degrees(lifted.camera.pitch))
+@pytest.fixture
+def uncorrected(monkeypatch, video):
+    """Return a lift before the assumed camera, with pitches of ± 1° and focal lengths of ± .1."""
+    error = track_lift._CameraError(np.radians(1.0), 0.1)
+
+    def kept(camera, _, heights, spreads, __):
+        return camera, error, track_lift._shared(heights, spreads)
+
+    monkeypatch.setattr(track_lift, "_levelled", kept)
+    return lift(video.track, image_size=video.size, progress=False, draws=40)
+
+
+def test_draws_have_pitches_of_their_own_where_it_is_estimated(video, uncorrected):
+    pitch = float(np.degrees(uncorrected.camera.pitch))
     given = lift(video.track, image_size=video.size, progress=False, draws=40, pitch=pitch)
 
     def inclination(draws: np.ndarray) -> np.ndarray:
@@ -166,19 +177,19 @@ def test_draws_have_pitches_of_their_own_where_it_is_estimated(monkeypatch, vide
         return np.degrees(np.arctan2(trunk[:, 2], trunk[:, 1]))
 
     # The same draws, each turned.
-    turns = inclination(lifted.draws) - inclination(given.draws)
+    turns = inclination(uncorrected.draws) - inclination(given.draws)
     assert np.std(turns) == pytest.approx(1.0, rel=0.3)
     # The floor stays where it is.
-    heights = lifted.draws[:, :, 0, 1].mean(axis=1)
+    heights = uncorrected.draws[:, :, 0, 1].mean(axis=1)
     assert np.std(heights) < 1.5 * np.std(given.draws[:, :, 0, 1].mean(axis=1)) + 0.06
 
 
-def test_draws_have_focal_lengths_of_their_own_without_a_field_of_view(video, lifted):
+def test_draws_have_focal_lengths_of_their_own_without_a_field_of_view(video, uncorrected):
     given = lift(video.track, image_size=video.size, progress=False, draws=40, fov=60.0)
-    assert np.allclose(about_hips(given.draws), about_hips(lifted.draws))
-    ratio = np.log(lifted.draws[..., 0, 2] / given.draws[..., 0, 2])
+    assert np.allclose(about_hips(given.draws), about_hips(uncorrected.draws))
+    ratio = np.log(uncorrected.draws[..., 0, 2] / given.draws[..., 0, 2])
     assert np.allclose(ratio, ratio[:, :1])
-    assert np.std(ratio[:, 0]) == pytest.approx(0.3, rel=0.4)
+    assert np.std(ratio[:, 0]) == pytest.approx(0.1, rel=0.4)
 
 
 @pytest.mark.parametrize(
@@ -294,22 +305,50 @@ def test_the_pitch_is_corrected_where_the_person_walks_towards_the_camera(monkey
     assert np.degrees(given.camera.pitch - true) == pytest.approx(error)
 
 
-def test_the_slope_of_floors_is_a_regression_with_a_prior():
+def test_the_focal_length_is_corrected_where_the_camera_looks_down():
+    video = film(make_gait("walk", 0, frames=120), 0, azimuth=0.0, height=3.0, fov=40.0)
+    pitch = float(np.degrees(np.arcsin(video.camera.rotation[0, 2, 1])))
+    result = lift(video.track, image_size=video.size, progress=False, draws=2, pitch=pitch)
+    assumed = 500 / np.tan(np.radians(30))
+    error, before = np.log(np.array([result.camera.focal, assumed]) / video.camera.focal[0])
+    assert abs(error) < 0.4 * abs(before)
+
+
+def test_a_level_floor_corrects_the_camera_by_a_regression_with_a_prior():
+    camera = LevelCamera(1000.0, (500.0, 500.0), pitch=-0.3)
+    error = track_lift._CameraError(0.06, 0.3)
     distances, spreads = np.array([4.0, 5.0, 7.0]), np.array([0.01, 0.02, 0.03])
     heights = -1.0 + 0.05 * distances
-    slope, sd = track_lift._slope(heights, spreads, distances)
-    # Bayesian linear regression with a flat intercept.
+    found, left, floor = track_lift._levelled(camera, error, heights, spreads, distances)
+    # Bayesian linear regression with a flat intercept: δ d − ρ tan p d.
     noise = spreads**2 + 0.02**2
-    design = np.stack([np.ones(3), distances], axis=1)
-    precision = design.T @ (design / noise[:, None]) + np.diag([0.0, np.radians(3.5) ** -2])
+    design = np.stack([np.ones(3), distances, -np.tan(-0.3) * distances], axis=1)
+    precision = design.T @ (design / noise[:, None]) + np.diag([0.0, 0.06**-2, 0.3**-2])
     expected = np.linalg.solve(precision, design.T @ (heights / noise))
-    assert slope == pytest.approx(expected[1])
-    assert sd == pytest.approx(np.linalg.inv(precision)[1, 1] ** 0.5)
-    # At one distance, floors do not tell the pitch.
-    assert track_lift._slope(heights, spreads, np.full(3, 5.0)) == (
-        0.0,
-        pytest.approx(np.radians(3.5)),
+    assert camera.pitch - found.pitch == pytest.approx(expected[1])
+    assert np.log(found.focal / camera.focal) == pytest.approx(expected[2])
+    assert left == pytest.approx(np.sqrt(np.diag(np.linalg.inv(precision)))[1:])
+    rise = expected[1] - np.tan(-0.3) * expected[2]
+    assert floor == pytest.approx(track_lift._shared(heights - rise * distances, spreads))
+
+
+@pytest.mark.parametrize(
+    ("error", "rise", "distances"),
+    [
+        pytest.param((0.0, 0.0), 0.05, [4.0, 5.0, 7.0], id="known camera"),
+        pytest.param((0.06, 0.3), 0.05, [5.0, 5.0, 5.0], id="one distance"),
+        pytest.param((0.06, 0.0), 0.3, [4.0, 5.0, 7.0], id="steps"),
+    ],
+)
+def test_a_camera_is_kept_where_floors_tell_nothing(error, rise, distances):
+    camera = LevelCamera(1000.0, (500.0, 500.0), pitch=-0.3)
+    heights, spreads = -1.0 + rise * np.array(distances), np.array([0.01, 0.02, 0.03])
+    found, left, floor = track_lift._levelled(
+        camera, track_lift._CameraError(*error), heights, spreads, np.array(distances)
     )
+    assert (found.pitch, found.focal) == pytest.approx((camera.pitch, camera.focal))
+    assert left == pytest.approx(error)
+    assert floor == pytest.approx(track_lift._shared(heights, spreads))
 
 
 def test_the_floor_of_several_windows_is_as_certain_as_they_agree():

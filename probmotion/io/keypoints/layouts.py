@@ -78,8 +78,8 @@ def _layout(detections: list[Detection], given: Skeleton | None, path: Path) -> 
             wanted = f"{count} keypoints{_TWO_LAYOUTS.get(count, '')}"
             known = ", ".join(f"{number} ({name})" for number, name in _BY_COUNT.items())
             raise MotionFileError(
-                f"{path}: skeleton must be given for {wanted}, got None; recognised numbers are "
-                f"{known}, 25 (body25, body25b), 133 and 136"
+                f"{path}: skeleton must be given for {wanted}, got None; recognised are {known}, "
+                "133 and 136 (bodies of COCO-WholeBody and Halpe)"
             )
         return Skeleton.preset(_BY_COUNT[count])
     if given.n_joints != count:
