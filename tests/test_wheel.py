@@ -61,7 +61,7 @@ def test_wheel_contains_every_module_and_nothing_else(wheel):
         for file in ("draws.npz", "certificate.json")
     }
     weights = [
-        "joint_limits.npz", "body-dvae.md", "body-dvae.safetensors",
+        "joint_limits.md", "joint_limits.npz", "body-dvae.md", "body-dvae.safetensors",
         "body-dvae-denoiser.safetensors", "cmu-motion.md", "cmu-motion.npz",
         "cmu-motion-coco17.md", "cmu-motion-coco17.npz", "salsa-pairs.md", "salsa-pairs.npz",
         "pose-depth.md", "pose-depth.npz", "joint-corrector.md", "joint-corrector.safetensors",

@@ -455,6 +455,7 @@ def recording(study: Study) -> pd.DataFrame:
             "noisy input": noisy,
             "Savitzky-Golay": filtered,
             "Kalman smoother": smoothed,
+            "spectral mixture, exact mean": spectral(study),
             "regression": study.dvae(DVAEInference()),
             "optimization": study.dvae(fit),
             "optimization, 200 iterations": study.dvae(replace(fit, iterations=200)),
