@@ -150,8 +150,8 @@ print(f"{smpl}, rotations {smpl.rotations.shape}")
 # ## 5. What one camera cannot tell
 #
 # A small person close to the camera looks like a tall one farther away, and so does a longer focal length. Without
-# `--fov`, 60° are assumed (which is right here); without `--height`, people are 1.7 m tall; without `--pitch`, the angle of
-# the camera is estimated, less well for motion unlike the prior's.
+# `--fov`, about 60° are assumed (which is right here); without `--height`, people are 1.7 m tall; without `--pitch`,
+# the angle of the camera is estimated, less well for motion unlike the prior's.
 
 # %%
 hip_path = truth.positions[:, hips].mean(axis=1)
