@@ -53,7 +53,7 @@ class Lift:
 
     fov: Annotated[float | None, arg(metavar="DEGREES", help_behavior_hint="")] = None
     """Horizontal field of view, degrees: distances from the camera depend on it. By default about
-    60 along the longer side, at most 39 to 87 for 90 % of the draws."""
+    60 along the longer side (39 to 87 in 90 % of videos), and each draw has its own."""
 
     pitch: Annotated[float | None, arg(metavar="DEGREES", help_behavior_hint="")] = None
     """Angle of the camera above the horizon, degrees, negative if it looks down. Estimated by

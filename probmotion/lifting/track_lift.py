@@ -229,7 +229,8 @@ def _levelled(
     """Return the camera before which the floors of windows are level, its errors, and the floor.
 
     If the pitch p is too large by δ, and the logarithm of the focal length too small by ρ, a level
-    floor seems to rise with the distance by δ − ρ tan p.
+    floor seems to rise with the distance by δ − ρ tan p. Before, both are 0 ± ``error``. Floors
+    that rise by more than these explain are not level, and tell nothing.
     """
     scales = np.array(error)
     effects = scales * [1.0, -np.tan(camera.pitch)]
