@@ -52,14 +52,14 @@ def usual_views(folder: Path, lifter_folder: Path | None = None) -> Iterator[tup
     rows: dict[str, list[tuple[float, float, float]]] = {"walk": [], "other": []}
     compared: dict[str, list[list[float]]] = {"walk": [], "other": []}
     baseline: dict[str, list[list[float]]] = {"walk": [], "other": []}
-    flagged, standing = [], []
+    flagged, ankles = [], []
     for number, clip in enumerate(held_out(folder)):
         for view, height in product(range(VIEWS), HEIGHTS):
             video = film(clip, number, azimuth=view * 2 * np.pi / VIEWS, height=height)
             result = lifted(video)
             kind = "walk" if clip.name.startswith(GAITS) else "other"
             if kind == "walk":
-                standing.append(feet(result, video))
+                ankles.append(feet(result, video))
             rows[kind].append(errors(result, video))
             if rows[kind][-1][0] <= GOOD:
                 flagged.append(not result.trusted)
@@ -75,8 +75,9 @@ def usual_views(folder: Path, lifter_folder: Path | None = None) -> Iterator[tup
     yield "lift_all_coverage_90", float(every[:, 1].mean())
     yield "lift_root_error", float(np.median(every[:, 2]))
     yield "lift_flagged_good", float(np.mean(flagged))
-    near, speed = map(np.concatenate, zip(*standing, strict=True))
+    near, own, speed = map(np.concatenate, zip(*ankles, strict=True))
     yield "lift_walk_feet_within_2_cm", float(near.mean())
+    yield "lift_walk_lifted_feet_within_2_cm", float(own.mean())
     yield "lift_walk_standing_feet_mm_per_s", 1000 * float(np.median(speed))
     for name, values in (("walk", compared["walk"]), ("all", compared["walk"] + compared["other"])):
         lifts, single, directed = np.nanmedian(values, axis=0)
@@ -153,24 +154,35 @@ def other_views(folder: Path) -> Iterator[tuple[str, float]]:
     yield "lift_distance_coverage_90", float(np.mean(inside))
 
 
-def feet(result: Lift, video: Video) -> tuple[np.ndarray, np.ndarray]:
-    """Return height and speed of the ankles in all frames in which the true ones stand.
+def feet(result: Lift, video: Video) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return heights and speeds of ankles in all frames in which they stand.
 
-    First, whether an ankle of the exported motion is within 2 cm of their median height, then the
-    speed of the lifted ankle, metres per second.
+    First, whether an ankle of the exported motion is within 2 cm of their median height, where the
+    true ones stand and where the lifted ones do; then the speed of the lifted ankle where the true
+    one stands, metres per second.
     """
+    fps = video.motion.fps
     true, mean, rigid = (
         motion.positions[:, ANKLES]
         for motion in (video.motion, result.mean, rigid_motion(result.mean))
     )
-    speed, own = (
-        np.linalg.norm(np.gradient(x, 1 / video.motion.fps, axis=0), axis=-1) for x in (true, mean)
-    )
-    height = true[..., 1] - np.quantile(true[..., 1], 0.05)
-    stands = (speed < SLOW) & (height < LOW)
-    heights = rigid[stands][:, 1]
-    level = np.median(heights) if len(heights) else 0.0
-    return np.abs(heights - level) < NEAR, own[stands]
+    near = []
+    for stands in (standing(true, fps), standing(mean, fps)):
+        heights = rigid[stands][:, 1]
+        level = np.median(heights) if len(heights) else 0.0
+        near.append(np.abs(heights - level) < NEAR)
+    return near[0], near[1], speeds(mean, fps)[standing(true, fps)]
+
+
+def standing(ankles: np.ndarray, fps: float) -> np.ndarray:
+    """Return where ankles (L, 2, 3) are slow and close to their lowest height, (L, 2)."""
+    height = ankles[..., 1] - np.quantile(ankles[..., 1], 0.05)
+    return (speeds(ankles, fps) < SLOW) & (height < LOW)
+
+
+def speeds(positions: np.ndarray, fps: float) -> np.ndarray:
+    """Return speeds of positions (L, J, 3), metres per second, (L, J)."""
+    return np.linalg.norm(np.gradient(positions, 1 / fps, axis=0), axis=-1)
 
 
 def errors(result: Lift, video: Video) -> tuple[float, float, float]:
