@@ -241,7 +241,8 @@ def _load(path: Path) -> Any:
     try:
         return json.loads(content)
     except (ValueError, RecursionError) as error:
-        raise MotionFileError(f"{path}: expected JSON ({str(error)[:80]})") from error
+        reason = str(error)[:80] if content else "the file is empty"
+        raise MotionFileError(f"{path}: expected JSON ({reason})") from error
 
 
 def _dicts(value: Any, where: str) -> list[dict[str, Any]]:

@@ -351,7 +351,10 @@ def test_invalid_arguments_and_files_are_refused(tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             read_keypoints(source, **arguments)
-    for content in (b"", b"\xff\xfe\x00", b"{", b"[" * 100_000, b'{"people": [' + b"9" * 5000):
+    path.write_bytes(b"")
+    with pytest.raises(MotionFileError, match=r"expected JSON \(the file is empty\)"):
+        read_keypoints(path, fps=1)
+    for content in (b"\xff\xfe\x00", b"{", b"[" * 100_000, b'{"people": [' + b"9" * 5000):
         path.write_bytes(content)
         with pytest.raises(MotionFileError, match="expected JSON"):
             read_keypoints(path, fps=1)
