@@ -12,7 +12,6 @@ Draws are stored in ``--out/comparisons``, views of the 2D model and lifted moti
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -22,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from parts import CLIPS, arguments, run_parts
 from scipy.special import logit
 
 from probmotion import seeds
@@ -633,13 +633,8 @@ PARTS = {
 
 def main() -> None:
     """Run the selected parts; each writes a table to ``--out``."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--out", type=Path, required=True, help="Output folder.")
-    data_folder = Path(__file__).parents[3] / "shared" / "data"
-    parser.add_argument("--data", type=Path, default=data_folder, help="Folder of the clips.")
-    names = list(PARTS)
-    parser.add_argument("--parts", nargs="+", choices=names, default=names, help="Parts to run.")
-    parser.add_argument("--quick", action="store_true", help="Synthetic walks and tiny networks.")
+    parser = arguments(__doc__, PARTS)
+    parser.add_argument("--data", type=Path, default=CLIPS, help="Folder of the clips.")
     parser.add_argument("--draws", type=int, help="Number of motions per sampler.")
     parser.add_argument("--iterations", type=int, help="Iterations of SDS.")
     parser.add_argument("--steps", type=int, default=4000, help="Training steps of networks.")
@@ -664,12 +659,7 @@ def main() -> None:
         name=options.prior,
         predictions=options.predictions,
     )
-    options.out.mkdir(parents=True, exist_ok=True)
-    for part in options.parts:
-        results = PARTS[part](study)
-        with written_whole(options.out / f"{part}.csv") as path:
-            results.to_csv(path, index=False)
-        print(f"\n{part}\n{results.round(3).to_string(index=False)}\n", flush=True)
+    run_parts(study, PARTS, options.parts)
 
 
 if __name__ == "__main__":

@@ -291,4 +291,4 @@ def shown(name: str, table: pd.DataFrame) -> pd.DataFrame:
 
 
 if __name__ == "__main__":
-    main(__doc__, MixedStudy, PARTS, shown, "mixed-pairs")
+    main(__doc__, MixedStudy, PARTS, shown)

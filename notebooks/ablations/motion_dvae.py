@@ -13,7 +13,6 @@ repository.
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -26,6 +25,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.ticker import NullFormatter
+from parts import CLIPS, arguments, run_parts
 
 from probmotion import seeds
 from probmotion.comparison import compare
@@ -560,13 +560,8 @@ PARTS = {
 
 def main() -> None:
     """Run the selected parts; each writes a table to ``--out``."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--out", type=Path, required=True, help="Output folder.")
-    data_folder = Path(__file__).parents[3] / "shared" / "data"
-    parser.add_argument("--data", type=Path, default=data_folder, help="Folder of the clips.")
-    names = list(PARTS)
-    parser.add_argument("--parts", nargs="+", choices=names, default=names, help="Parts to run.")
-    parser.add_argument("--quick", action="store_true", help="Synthetic clips and tiny networks.")
+    parser = arguments(__doc__, PARTS)
+    parser.add_argument("--data", type=Path, default=CLIPS, help="Folder of the clips.")
     parser.add_argument("--per-clip", type=int, default=6, help="Recordings per test clip.")
     parser.add_argument(
         "--seeds", nargs="+", type=int, default=[0, 1, 2], help="Seeds of the part trainings."
@@ -574,14 +569,9 @@ def main() -> None:
     options = parser.parse_args()
     per_clip = 2 if options.quick else options.per_clip
     study = Study(options.out, options.data, options.quick, per_clip, seeds=options.seeds)
-    options.out.mkdir(parents=True, exist_ok=True)
-    for part in options.parts:
-        if part == "recording" and study.quick:
-            continue  # requires the real recording
-        results = PARTS[part](study)
-        with written_whole(options.out / f"{part}.csv") as path:
-            results.to_csv(path, index=False)
-        print(f"\n{part}\n{results.round(3).to_string(index=False)}\n", flush=True)
+    # There is no made recording.
+    parts = [name for name in options.parts if name != "recording" or not study.quick]
+    run_parts(study, PARTS, parts)
 
 
 if __name__ == "__main__":

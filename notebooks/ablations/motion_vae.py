@@ -13,7 +13,6 @@ the evaluation.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -24,13 +23,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
+from parts import CLIPS, arguments, run_parts
 
 from probmotion import seeds
 from probmotion.comparison import compare
 from probmotion.data.projections import Filming, centre_motion
 from probmotion.data.synthetic.walks import synthetic_walks, walk_clips
 from probmotion.data.tracks.learning import certain, film_clips
-from probmotion.files import written_whole
 from probmotion.metrics.filming import film_motions
 from probmotion.metrics.keypoints import (
     image_extent,
@@ -374,13 +373,8 @@ PARTS = {"views": views, "table": table, "data": data, "generation": generation}
 
 def main() -> None:
     """Run the selected parts; each writes a table to ``--out``."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--out", type=Path, required=True, help="Output folder.")
-    data_folder = Path(__file__).parents[3] / "shared" / "data"
-    parser.add_argument("--data", type=Path, default=data_folder, help="Folder of the clips.")
-    names = list(PARTS)
-    parser.add_argument("--parts", nargs="+", choices=names, default=names, help="Parts to run.")
-    parser.add_argument("--quick", action="store_true", help="Synthetic walks and tiny networks.")
+    parser = arguments(__doc__, PARTS)
+    parser.add_argument("--data", type=Path, default=CLIPS, help="Folder of the clips.")
     parser.add_argument("--steps", type=int, help="Training steps of the second phase.")
     parser.add_argument("--draws", type=int, help="Generated sequences; default: 1400.")
     parser.add_argument(
@@ -390,12 +384,7 @@ def main() -> None:
     draws = options.draws or (60 if options.quick else 1400)
     given = options.out, options.data, options.quick, options.steps, draws, options.seed
     study = Study(*given)
-    options.out.mkdir(parents=True, exist_ok=True)
-    for part in options.parts:
-        results = PARTS[part](study)
-        with written_whole(options.out / f"{part}.csv") as path:
-            results.to_csv(path, index=False)
-        print(f"\n{part}\n{results.round(3).to_string(index=False)}\n", flush=True)
+    run_parts(study, PARTS, options.parts)
 
 
 if __name__ == "__main__":

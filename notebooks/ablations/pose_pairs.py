@@ -12,8 +12,6 @@ of the part coverage. The data are located by :func:`probmotion.data.downloads.s
 
 from __future__ import annotations
 
-import argparse
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -22,6 +20,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import pandas as pd
+from parts import arguments, run_parts
 
 from probmotion import seeds
 from probmotion.comparison import Comparison, compare
@@ -34,7 +33,6 @@ from probmotion.data.pair_sets import (
     hold_out,
 )
 from probmotion.data.synthetic.dances import synthetic_dances
-from probmotion.files import written_whole
 from probmotion.interaction.annotations.sources import DrawnAnnotations, draw_annotations
 from probmotion.interaction.geometry.coordinates import align_rigidly
 from probmotion.interaction.geometry.pose_distances import MEASURES, pose_distances
@@ -448,17 +446,9 @@ def main(
     kind: type[S],
     parts: Mapping[str, Callable[[S], pd.DataFrame]],
     shown: Callable[[str, pd.DataFrame], pd.DataFrame],
-    folder: str,
 ) -> None:
-    """Run the selected parts of a kind of study and print every table as ``shown`` returns it.
-
-    ``folder`` is the default of ``--out``.
-    """
-    parser = argparse.ArgumentParser(description=description.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path(folder), help="Output folder.")
-    names = list(parts)
-    parser.add_argument("--parts", nargs="*", choices=names, default=names, help="Parts to run.")
-    parser.add_argument("--quick", action="store_true", help="Synthetic dances and few draws.")
+    """Run the selected parts of a kind of study and print every table as ``shown`` returns it."""
+    parser = arguments(description, parts)
     parser.add_argument("--draws", type=int, help="Draws of all chains; default: 100000.")
     parser.add_argument("--repeats", type=int, default=3, help="Number of repeats.")
     options = parser.parse_args()
@@ -466,7 +456,6 @@ def main(
     given = 400 if options.draws is None else options.draws
     if options.repeats < 1 or given < 400 or given % 40:
         parser.error("--repeats must be at least 1, --draws a multiple of 40 and at least 400")
-    options.out.mkdir(parents=True, exist_ok=True)
     study = kind(
         options.out,
         options.quick,
@@ -477,13 +466,8 @@ def main(
         n_annotations=300 if options.quick else 6000,
         n_held_out=40 if options.quick else 300,
     )
-    for name in options.parts:
-        start = time.perf_counter()
-        table = parts[name](study)
-        with written_whole(options.out / f"{name}.csv") as unfinished:
-            table.to_csv(unfinished, index=False)
-        print(f"\n{name} ({time.perf_counter() - start:.0f} s)\n{shown(name, table).to_string()}")
+    run_parts(study, parts, options.parts, lambda name, table: shown(name, table).to_string())
 
 
 if __name__ == "__main__":
-    main(__doc__, Study, PARTS, shown, "pose-pairs")
+    main(__doc__, Study, PARTS, shown)

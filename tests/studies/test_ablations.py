@@ -19,6 +19,7 @@ SCRIPTS = Path(__file__).parents[2] / "notebooks" / "ablations"
 
 def run(script: str, *arguments: str, monkeypatch) -> None:
     monkeypatch.setattr(sys, "argv", [script, *arguments])
+    monkeypatch.syspath_prepend(SCRIPTS)
     runpy.run_path(str(SCRIPTS / script), run_name="__main__")
 
 
