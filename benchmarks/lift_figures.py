@@ -30,6 +30,7 @@ MADE = 100  # videos of each kind that must be flagged
 COMPARED = 3  # frames of each video that the baseline lifts
 FOVS = (43.0, 52.0, 68.0, 81.0)  # 10, 30, 70 and 90 % points of those that lifts assume, degrees
 SLOW, LOW, NEAR = 0.2, 0.05, 0.02  # of feet that stand, m/s and metres; metres from their level
+ANKLE = 0.075  # height of standing ankles, metres
 
 
 def lift_figures(folder: Path, lifter_folder: Path | None = None) -> Iterator[tuple[str, float]]:
@@ -43,9 +44,9 @@ def usual_views(folder: Path, lifter_folder: Path | None = None) -> Iterator[tup
     """Yield figures of videos with the field of view that lifts assume.
 
     They are medians over videos; coverages are means. ``walk`` is walking and running.
-    ``lift_all_over_single_pose`` is the ratio of the median errors of the lift and of single poses
+    ``lift_over_single_pose`` is the ratio of the median errors of the lift and of single poses
     lifted by joint limits (:mod:`single_pose_baseline`), in the same frames.
-    ``lift_all_over_unsupervised`` is that to the unsupervised lifter in ``lifter_folder``
+    ``lift_over_unsupervised`` is that to the unsupervised lifter in ``lifter_folder``
     (:mod:`unsupervised_baseline`), in all frames, with estimated or known distance and pitch.
     """
     lifter = None if lifter_folder is None else trained_lifter(folder, lifter_folder)
@@ -77,13 +78,14 @@ def usual_views(folder: Path, lifter_folder: Path | None = None) -> Iterator[tup
     yield "lift_flagged_good", float(np.mean(flagged))
     near, own, speed = map(np.concatenate, zip(*ankles, strict=True))
     yield "lift_walk_feet_within_2_cm", float(near.mean())
-    yield "lift_walk_lifted_feet_within_2_cm", float(own.mean())
+    yield "lift_walk_standing_feet_within_2_cm_of_floor", float(own.mean())
     yield "lift_walk_standing_feet_mm_per_s", 1000 * float(np.median(speed))
     for name, values in (("walk", compared["walk"]), ("all", compared["walk"] + compared["other"])):
         lifts, single, directed = np.nanmedian(values, axis=0)
         yield f"lift_{name}_single_pose_mpjpe_mm", single
-        yield f"lift_{name}_over_single_pose", lifts / single
-        yield f"lift_{name}_over_single_pose_known_direction", lifts / directed
+        start = "lift" if name == "all" else f"lift_{name}"
+        yield f"{start}_over_single_pose", lifts / single
+        yield f"{start}_over_single_pose_known_direction", lifts / directed
     if lifter is not None:
         for name, lifts, values in (
             ("walk", walk, baseline["walk"]),
@@ -91,8 +93,9 @@ def usual_views(folder: Path, lifter_folder: Path | None = None) -> Iterator[tup
         ):
             blind, told = np.median(values, axis=0)
             yield f"lift_{name}_unsupervised_mpjpe_mm", blind
-            yield f"lift_{name}_over_unsupervised", np.median(lifts[:, 0]) / blind
-            yield f"lift_{name}_over_unsupervised_known_distance", np.median(lifts[:, 0]) / told
+            start = "lift" if name == "all" else f"lift_{name}"
+            yield f"{start}_over_unsupervised", np.median(lifts[:, 0]) / blind
+            yield f"{start}_over_unsupervised_known_distance", np.median(lifts[:, 0]) / told
 
 
 def wrong_videos(folder: Path) -> Iterator[tuple[str, float]]:
@@ -158,20 +161,19 @@ def feet(result: Lift, video: Video) -> tuple[np.ndarray, np.ndarray, np.ndarray
     """Return heights and speeds of ankles in all frames in which they stand.
 
     First, whether an ankle of the exported motion is within 2 cm of their median height, where the
-    true ones stand and where the lifted ones do; then the speed of the lifted ankle where the true
-    one stands, metres per second.
+    true ones stand, and of its height on the floor y = 0, where the lifted ones stand; then the
+    speed of the lifted ankle where the true one stands, metres per second.
     """
     fps = video.motion.fps
     true, mean, rigid = (
         motion.positions[:, ANKLES]
         for motion in (video.motion, result.mean, rigid_motion(result.mean))
     )
-    near = []
-    for stands in (standing(true, fps), standing(mean, fps)):
-        heights = rigid[stands][:, 1]
-        level = np.median(heights) if len(heights) else 0.0
-        near.append(np.abs(heights - level) < NEAR)
-    return near[0], near[1], speeds(mean, fps)[standing(true, fps)]
+    stands = standing(true, fps)
+    heights, own = rigid[stands][:, 1], rigid[standing(mean, fps)][:, 1]
+    level = np.median(heights) if len(heights) else 0.0
+    near, on_floor = (np.abs(x - at) < NEAR for x, at in ((heights, level), (own, ANKLE)))
+    return near, on_floor, speeds(mean, fps)[stands]
 
 
 def standing(ankles: np.ndarray, fps: float) -> np.ndarray:

@@ -35,6 +35,7 @@ __all__ = [
     "write_errors",
     "write_json",
     "write_seal",
+    "written_together",
     "written_whole",
 ]
 
@@ -139,15 +140,34 @@ def writable_folder(folder: Path, name: str = "out") -> Path:
     return folder
 
 
-def check_writable(folder: Path) -> None:
-    """Raise ``OSError`` if the folder ``out`` is not writable; delete what this creates."""
+@contextmanager
+def written_together(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder; move its files to ``folder`` once the block succeeds.
+
+    Otherwise ``folder`` is as before, or does not exist if it did not.
+
+    Raises
+    ------
+    OSError
+        If ``folder``, the argument ``out`` of a command, is not writable.
+    """
     missing = [path for path in (folder, *folder.parents) if not os.path.exists(path)]
     try:
         writable_folder(folder)
+        with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=folder) as unfinished:
+            yield Path(unfinished)
+            for path in sorted(Path(unfinished).iterdir()):
+                os.replace(path, folder / path.name)
     finally:
         for path in missing:
-            with suppress(OSError):  # another process may use it
+            with suppress(OSError):  # it has files
                 path.rmdir()
+
+
+def check_writable(folder: Path) -> None:
+    """Raise ``OSError`` if the folder ``out`` is not writable; delete what this creates."""
+    with written_together(folder):
+        pass
 
 
 @contextmanager

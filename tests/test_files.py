@@ -1,6 +1,6 @@
 import pytest
 
-from probmotion.files import check_writable
+from probmotion.files import check_writable, written_together
 
 
 def test_checking_a_folder_leaves_nothing_behind(tmp_path, monkeypatch):
@@ -15,3 +15,28 @@ def test_checking_a_folder_leaves_nothing_behind(tmp_path, monkeypatch):
     with pytest.raises(OSError, match=r"out must be a writable folder, got .*: File name too long"):
         check_writable(tmp_path / "made" / ("long" * 100))
     assert list(tmp_path.iterdir()) == [kept]
+
+
+def test_files_are_written_together_or_not_at_all(tmp_path):
+    out = tmp_path / "new" / "out"
+
+    def interrupted():
+        with written_together(out) as unfinished:
+            (unfinished / "first.txt").write_text("1", encoding="utf-8")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert not any(tmp_path.iterdir())
+    out.mkdir(parents=True)
+    (out / "first.txt").write_text("0", encoding="utf-8")
+    (out / "other.txt").write_text("0", encoding="utf-8")
+    with written_together(out) as unfinished:
+        for name in ("first.txt", "second.txt"):
+            (unfinished / name).write_text("1", encoding="utf-8")
+        assert (out / "first.txt").read_text(encoding="utf-8") == "0"
+    assert {path.name: path.read_text(encoding="utf-8") for path in out.iterdir()} == {
+        "first.txt": "1",
+        "other.txt": "0",
+        "second.txt": "1",
+    }

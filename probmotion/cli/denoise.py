@@ -103,16 +103,16 @@ class Denoise(Conventions):
 
 def _write(track: JointTrack, result: Any, out: Path) -> None:
     """Write ``denoised.npz`` and ``mean.bvh``."""
-    from probmotion.files import writable_folder
+    from probmotion.files import written_together
     from probmotion.io.bvh_writing import write_bvh
     from probmotion.io.npz import write_npz
     from probmotion.motion.motion import Motion
 
-    writable_folder(out)
     mean = Motion(result.mean, track.skeleton, track.fps, name=track.name)
     posterior = {"sd": result.sd, "draws": result.draws, "noise": result.noise}
-    write_npz(mean, out / "denoised.npz", posterior)
-    write_bvh(mean, out / "mean.bvh")
+    with written_together(out) as unfinished:
+        write_npz(mean, unfinished / "denoised.npz", posterior)
+        write_bvh(mean, unfinished / "mean.bvh")
 
 
 def _summary(track: JointTrack, result: Any, path: Path, estimated: bool) -> str:

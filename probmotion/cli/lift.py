@@ -9,9 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 if TYPE_CHECKING:
+    from probmotion.io.keypoints.tracks import KeypointFile
     from probmotion.motion.motion import KeypointTrack
 
 __all__ = ["Lift", "Reconstruct"]
+
+_RATE_ERROR = 0.05  # of frame rates from rounded timestamps, relative
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +36,8 @@ class Lift:
     image_size: Annotated[
         tuple[int, int] | None, arg(metavar="WIDTH HEIGHT", help_behavior_hint="")
     ] = None
-    """Size of the video, pixels; required without --camera."""
+    """Size of the video, pixels; the file's by default. Required if it has none, without --camera.
+    """
 
     camera: Annotated[Path | None, arg(metavar="TOML", help_behavior_hint="")] = None
     """Calibration of Pose2Sim: the motion is in its world. Files and folders are named after its
@@ -75,12 +79,14 @@ class Lift:
         from probmotion.files import check_writable
         from probmotion.lifting.recording_lift import lift
 
-        if self.image_size is None and self.camera is None:
+        files = self._files()
+        size = self.image_size or files[0].image_size
+        if size is None and self.camera is None:
             raise ValueError(
                 "--image-size or --camera must be given, got neither; --image-size 1920 1080 is a "
                 "video of this width and height"
             )
-        people = self._people()
+        people = self._people(files)
         check_writable(self.out)
         doubtful, refused = [], []
         for number, tracks in enumerate(people):
@@ -88,7 +94,7 @@ class Lift:
             try:
                 result = lift(
                     tracks,
-                    image_size=self.image_size,
+                    image_size=size if self.camera is None else self.image_size,
                     camera=self.camera,
                     fov=self.fov,
                     pitch=self.pitch,
@@ -120,11 +126,13 @@ class Lift:
                 f"{', '.join(doubtful)}; see lift.html"
             )
 
-    def _people(self) -> list[list[KeypointTrack]]:
-        """Return the tracks of every person, one a camera."""
+    def _files(self) -> list[KeypointFile]:
+        """Return the content of the file of every camera, whose tracks are named after it."""
         from probmotion.io.keypoints.calibration import view_folders
 
         paths = list(self.keypoints)
+        if not paths:
+            raise ValueError("KEYPOINTS must be a file or folder of a detector, got none")
         if self.camera is not None and len(paths) == 1:
             paths = view_folders(paths[0])
         if self.camera is None and len(paths) > 1:
@@ -134,28 +142,46 @@ class Lift:
                 "--person must not be given with several cameras, whose people may have other "
                 f"numbers, got {self.person}; associate people before (pose-associated of Pose2Sim)"
             )
-        views = [self._tracks(path) for path in paths]
-        if len(views) == 1:
-            return [[track] for track in views[0]]
-        for path, tracks in zip(paths, views, strict=True):
-            if len(tracks) != 1:
-                raise ValueError(
-                    f"keypoints of several cameras must be of one person, got {len(tracks)} in "
-                    f"{path}; associate people before (pose-associated of Pose2Sim)"
-                )
-        return [[tracks[0] for tracks in views]]
+        return [self._file(path) for path in paths]
 
-    def _tracks(self, path: Path) -> list[KeypointTrack]:
-        """Return the tracks of a camera, with its file's name if there is a calibration."""
-        from probmotion.io.keypoints.files import read_keypoints
+    def _file(self, path: Path) -> KeypointFile:
+        """Return the content of a file, with the given frame rate if it has none."""
+        from probmotion.io.keypoints.files import open_keypoints
 
-        size = None if self.image_size is None else (self.image_size[0], self.image_size[1])
-        tracks = read_keypoints(path, self.fps, self.skeleton, self.people, size)
-        if self.person is not None:
+        file = open_keypoints(path, None, self.skeleton, self.people, self.image_size)
+        fps = self.fps or file.fps
+        if fps is None:
+            raise ValueError(
+                f"--fps must be given for {path}, which contains no frame rate, got none; --fps 30 "
+                "is a video of 30 frames per second"
+            )
+        if file.fps is not None and abs(fps / file.fps - 1) > _RATE_ERROR:
+            raise ValueError(
+                f"--fps must be the frame rate of {path}, {file.fps:g}, got {fps:g}; leave it out"
+            )
+        tracks = [replace(track, fps=fps) for track in file.tracks]
+        if self.camera is not None:
+            tracks = [replace(track, name=path.stem) for track in tracks]
+        return replace(file, fps=fps, tracks=tracks)
+
+    def _people(self, files: list[KeypointFile]) -> list[list[KeypointTrack]]:
+        """Return the tracks of every person, one a camera."""
+        if len(files) == 1:
+            tracks = files[0].tracks
+            if self.person is None:
+                return [[track] for track in tracks]
             if not 0 <= self.person < len(tracks):
-                raise ValueError(f"person must be 0 to {len(tracks) - 1}, got {self.person}")
-            tracks = [tracks[self.person]]
-        return tracks if self.camera is None else [replace(t, name=path.stem) for t in tracks]
+                people = "a single person, 0" if len(tracks) == 1 else f"0 to {len(tracks) - 1}"
+                raise ValueError(f"--person must be {people}, got {self.person}")
+            return [[tracks[self.person]]]
+        for file in files:
+            if len(file.tracks) != 1:
+                raise ValueError(
+                    f"keypoints of several cameras must be of one person, got {len(file.tracks)} "
+                    f"in {file.tracks[0].name}; associate people before (pose-associated of "
+                    "Pose2Sim)"
+                )
+        return [[file.tracks[0] for file in files]]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -114,7 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 # Flush here, so that a closed pipe is caught below.
                 sys.stdout.flush()
         except KeyboardInterrupt as error:
-            return _fail(str(error) or "interrupted; nothing was written", 130)
+            return _fail(str(error) or "interrupted; nothing more was written", 130)
         except BrokenPipeError:
             # The reader has closed the pipe, as in `probmotion list | head`.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

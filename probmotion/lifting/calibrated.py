@@ -95,6 +95,7 @@ def calibrated_views(
     if len(tracks) > _MOST:
         raise ValueError(f"tracks must be of at most {_MOST} cameras, got {len(tracks)}")
     found = calibration.matched([track.name for track in tracks])
+    tracks = _in_step(tracks)
     for what, values in (
         ("number of frames", [track.frames for track in tracks]),
         ("frame rate", [track.fps for track in tracks]),
@@ -105,6 +106,27 @@ def calibrated_views(
                 f"{', '.join(f'{value:g}' for value in values)}; synchronise the videos"
             )
     return found, [_view(track, calibration, v) for track, v in zip(tracks, found, strict=True)]
+
+
+def _in_step(tracks: Sequence[KeypointTrack]) -> Sequence[KeypointTrack]:
+    """Return tracks of the same frames, if all end where detections end."""
+    starts = [track.start for track in tracks if track.start is not None]
+    if len(starts) < len(tracks):
+        return tracks
+    stops = [start + track.frames for start, track in zip(starts, tracks, strict=True)]
+    if max(starts) >= min(stops):
+        raise ValueError(
+            "tracks of all cameras must have frames in common, got first frames "
+            f"{', '.join(map(str, starts))}; synchronise the videos"
+        )
+    first, padded = min(starts), []
+    for start, stop, track in zip(starts, stops, tracks, strict=True):
+        rows = slice(start - first, stop - first)
+        keypoints = np.full((max(stops) - first, *track.keypoints.shape[1:]), np.nan)
+        confidence = np.zeros(keypoints.shape[:2])
+        keypoints[rows], confidence[rows] = track.keypoints, track.confidence
+        padded.append(replace(track, keypoints=keypoints, confidence=confidence, start=first))
+    return padded
 
 
 def _view(track: KeypointTrack, calibration: Calibration, index: int) -> CalibratedView:

@@ -122,8 +122,8 @@ def uncertain(windows: Sequence[WindowSummary]) -> Check:
         "uncertain",
         float(np.nanmedian(spreads)),
         _UNCERTAIN,
-        "joints have a standard deviation of more than 12 cm relative to the hips (hidden legs, "
-        "motion unlike that of the prior's clips, another animal, swapped joints?)",
+        "joints have a standard deviation of more than 12 cm relative to the hips (hidden legs, a "
+        "rotated video, motion unlike that of the prior's clips, another animal, swapped joints?)",
     )
 
 

@@ -71,7 +71,10 @@ def lift_page(
     )
     rows = {"lift": np.concatenate([motion.positions[None], shown_draws])}
     shown = Shown(problem, rows, step, overlaid=True)
-    caption = "mean and three draws; joints coloured by their standard deviation"
+    caption = (
+        f"mean and {min(3, len(draws))} draws; joints coloured by the standard deviation of "
+        f"{len(shown_draws)} draws"
+    )
     if cameras.n_views > 1:
         caption += f"; the camera’s view and keypoints are those of {camera_names[view]}"
     animation = animation_html(name, shown, {"lift": caption})

@@ -12,7 +12,7 @@ import numpy as np
 from probmotion import seeds
 from probmotion.data.pair_sets import choose_seed
 from probmotion.data.pairs import pair_of
-from probmotion.files import writable_folder, written_whole
+from probmotion.files import written_together, written_whole
 from probmotion.interaction.annotations.annotations import Annotations
 from probmotion.interaction.annotations.tracks import (
     annotations_of_keypoints,
@@ -114,32 +114,35 @@ class LiftedPairs:
         ``pairs.npz`` (mean, standard deviations and draws), ``annotations.npz`` and ``prior.npz``.
         """
         folder = Path(folder)
-        writable_folder(folder)
-        write_npz(self.mean, folder / "pairs.npz", {"sd": self.sd, "draws": self.draws})
-        self.annotations.save(folder / "annotations.npz")
-        self.prior.save(folder / "prior.npz")
-        rigid = rigid_motion(self.mean)
-        save(rigid, folder / "pairs.bvh")
-        save(rigid, folder / "pairs.glb")
-        self.report(folder / "pairs.html")  # last: its command reads the others
+        with written_together(folder) as unfinished:
+            write_npz(self.mean, unfinished / "pairs.npz", {"sd": self.sd, "draws": self.draws})
+            self.annotations.save(unfinished / "annotations.npz")
+            self.prior.save(unfinished / "prior.npz")
+            rigid = rigid_motion(self.mean)
+            save(rigid, unfinished / "pairs.bvh")
+            save(rigid, unfinished / "pairs.glb")
+            (unfinished / "pairs.html").write_text(self._page(folder), encoding="utf-8")
 
     def report(self, path: str | Path) -> Path:
         """Write a page to browse the pairs beside the keypoints, and return its path."""
         path = Path(path)
         if path.suffix.lower() != ".html":
             raise ValueError(f"path must end in .html, got {str(path)!r}")
-        page = pair_page(
+        with written_whole(path) as unfinished:
+            unfinished.write_text(self._page(path.parent), encoding="utf-8")
+        return path
+
+    def _page(self, folder: Path) -> str:
+        """Return the page, whose command reads the files of a folder."""
+        return pair_page(
             self.mean,
             self.sd,
             self.draws,
             self.keypoints,
             self.valid_seeds,
             self.summary(),
-            path.parent,
+            folder,
         )
-        with written_whole(path) as unfinished:
-            unfinished.write_text(page, encoding="utf-8")
-        return path
 
 
 def lift_pairs(

@@ -109,7 +109,7 @@ def lift(
     check_count("draws", draws, least=2)
     check_count("seed", seed, least=0)
     if not tracks:
-        raise ValueError("track must be at least one track, got none")
+        raise ValueError("track must be a track or one of every camera, got none")
     for each in tracks:
         if each.fps < _SLOWEST:
             raise ValueError(
@@ -311,5 +311,5 @@ def _check_inside(keypoints: PersonKeypoints, image_size: tuple[int, int]) -> No
         raise ValueError(
             f"keypoints must be pixels of an image of {image_size[0]} × {image_size[1]}, got "
             f"{low[0]:.3g} to {high[0]:.3g} in x and {low[1]:.3g} to {high[1]:.3g} in y; give "
-            "the video's size as image_size"
+            "the video's size (--image-size) and keypoints in pixels"
         )

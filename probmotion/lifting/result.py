@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from probmotion.files import writable_folder, written_whole
+from probmotion.files import written_together, written_whole
 from probmotion.geometry.cameras import Cameras
 from probmotion.io.files import save
 from probmotion.io.npz import write_npz
@@ -158,8 +158,11 @@ class Lift:
         deviations and draws), ``lift.smpl22.npz``
         (:func:`~probmotion.io.smpl.smpl_motion` of the mean) and ``summary.json``.
         """
-        folder = Path(folder)
-        writable_folder(folder)
+        with written_together(Path(folder)) as unfinished:
+            self._write(unfinished)
+
+    def _write(self, folder: Path) -> None:
+        """Write the files of :meth:`save`."""
         self.report(folder / "lift.html")
         rigid = rigid_motion(self.mean)
         save(rigid, folder / "lift.bvh")
@@ -193,5 +196,4 @@ class Lift:
             "noise_pixels": self.noise,
             "swapped_share": self.swapped,
         }
-        with written_whole(folder / "summary.json") as unfinished:
-            unfinished.write_text(json.dumps(content, indent=1), encoding="utf-8")
+        (folder / "summary.json").write_text(json.dumps(content, indent=1), encoding="utf-8")

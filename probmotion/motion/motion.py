@@ -252,6 +252,9 @@ class KeypointTrack:
         Frames per second.
     name : str
         Name of the track.
+    start : int, optional
+        Number of the first frame in the video, if the track ends where detections end. Synchronised
+        tracks are padded by it; others must have all frames.
 
     Raises
     ------
@@ -265,6 +268,7 @@ class KeypointTrack:
     skeleton: Skeleton
     fps: float
     name: str = field(default="")
+    start: int | None = None
 
     def __post_init__(self) -> None:
         keypoints = np.asarray(self.keypoints, dtype=np.float64)

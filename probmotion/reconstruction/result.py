@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from probmotion.extras import torch
-from probmotion.files import writable_folder, written_whole
+from probmotion.files import written_together, written_whole
 from probmotion.io.glb import write_glb
 from probmotion.io.npz import write_npz
 from probmotion.lifting.checks import Check
@@ -178,8 +178,11 @@ class Reconstruction:
         ``reconstruction.npz`` (the closest one's motion, θ of the mode and the draws, and the
         draws' joints), and ``summary.json``.
         """
-        folder = Path(folder)
-        writable_folder(folder)
+        with written_together(Path(folder)) as unfinished:
+            self._write(unfinished)
+
+    def _write(self, folder: Path) -> None:
+        """Write the files of :meth:`save`."""
         self.report(folder / "reconstruct.html")
         moving, name = self._moving(), self.prior.category.name
         motion, *others = (
@@ -205,8 +208,7 @@ class Reconstruction:
             "facing_degrees": self.facing.tolist(),
             "sd_metres": dict(zip(self.prior.skeleton.joint_names, self.sd.tolist(), strict=True)),
         }
-        with written_whole(folder / "summary.json") as unfinished:
-            unfinished.write_text(json.dumps(content, indent=1), encoding="utf-8")
+        (folder / "summary.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
 
     def _moving(self) -> np.ndarray:
         """Return θ (n, dim) of the mode with motions and poses of the draws closest at first.

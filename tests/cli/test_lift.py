@@ -8,7 +8,9 @@ from probmotion.data.synthetic.gaits import make_gait
 from probmotion.data.videos import film
 from probmotion.geometry.rotations import matrix_to_vector
 from probmotion.io.conventions import Z_UP_TO_Y_UP
-from probmotion.io.files import load
+from probmotion.io.files import load, save
+from probmotion.lifting import result
+from probmotion.motion.presets import PRESETS
 from probmotion.motion.skeleton import Skeleton
 
 NAMES = ["lift.bvh", "lift.glb", "lift.html", "lift.npz", "lift.smpl22.npz", "summary.json"]
@@ -56,13 +58,74 @@ def test_people_who_are_hardly_visible_are_named(capsys, fails, detections, tmp_
     assert "track must show the person" in fails("lift", str(path), "--fps", "30", *SIZE, *strict)
 
 
+@pytest.fixture(scope="module")
+def landmarks(tmp_path_factory):
+    """Write a walk as MediaPipe's normalised landmarks with rate and size; return the path."""
+    track = film(make_gait("walk", 1, frames=45), 0, azimuth=0.8).track
+    names = PRESETS["mediapipe33"].joint_names
+    values = np.zeros((track.frames, len(names), 4))  # x, y, z and visibility
+    for joint, name in enumerate(track.skeleton.joint_names):
+        place = names.index(name)
+        values[:, place, :2] = np.nan_to_num(track.keypoints[:, joint]) / 1000
+        values[:, place, 3] = track.confidence[:, joint]
+    frames = [{"pose_landmarks": points} for points in values.tolist()]
+    path = tmp_path_factory.mktemp("mediapipe") / "walk.json"
+    content = {"fps": 30, "width": 1000, "height": 1000, "frames": frames}
+    path.write_text(json.dumps(content), encoding="utf-8")
+    return path
+
+
+def test_rate_and_size_of_the_file_are_used_and_must_not_be_contradicted(
+    fails, landmarks, tmp_path
+):
+    out = tmp_path / "out"
+    words = ["lift", str(landmarks), "--draws", "2", "--out", str(out)]
+    assert "--fps must be the frame rate of" in fails(*words, "--fps", "60")
+    message = fails(*words, "--image-size", "1920", "1080")
+    assert "walk.json, (1000, 1000), got (1920, 1080); leave it out" in message
+    assert not out.exists()
+    assert main([*words, "--fps", "29.97"]) == 0
+    assert load(out / "lift.bvh").fps == pytest.approx(29.97)
+
+
+def test_an_interrupted_lift_leaves_whole_folders_alone(capsys, monkeypatch, detections, tmp_path):
+    saved = []
+
+    def interrupted(motion, path):
+        save(motion, path)
+        saved.append(path)
+        if len(saved) == 4:  # lift.bvh of the second person
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(result, "save", interrupted)
+    out = tmp_path / "out"
+    words = ["lift", str(detections), "--fps", "30", *SIZE, "--draws", "2", "--out", str(out)]
+    assert main(words) == 130
+    assert "interrupted; nothing more was written" in capsys.readouterr().err
+    assert [folder.name for folder in out.iterdir()] == ["person-0"]
+    assert sorted(path.name for path in (out / "person-0").iterdir()) == NAMES
+
+
+def test_strict_fails_for_motion_that_is_not_trusted(fails, detections, tmp_path):
+    results = json.loads(detections.read_text(encoding="utf-8"))
+    rng = np.random.default_rng(0)
+    for each in results:
+        points = rng.uniform(200, 800, (17, 2))
+        each["keypoints"] = np.column_stack([points, np.ones(17)]).ravel().tolist()
+    path = tmp_path / "random.json"
+    path.write_text(json.dumps(results), encoding="utf-8")
+    words = ["lift", str(path), "--fps", "30", *SIZE, "--person", "0", "--draws", "2", "--strict"]
+    message = fails(*words, "--out", str(tmp_path / "out"))
+    assert "motions must pass all checks with --strict" in message
+
+
 def test_errors_are_one_line_and_leave_no_files(fails, detections, tmp_path):
     out = tmp_path / "out"
     base = ["lift", str(detections), "--out", str(out)]
     cases = {
         ("--fps", "30", "--image-size", "100", "100"): "pixels of an image of 100 × 100",
-        (*SIZE,): "give the video's (fps=30, --fps 30)",
-        ("--fps", "30", *SIZE, "--person", "5"): "person must be 0 to 1, got 5",
+        (*SIZE,): "--fps 30 is a video of 30 frames per second",
+        ("--fps", "30", *SIZE, "--person", "5"): "--person must be 0 to 1, got 5",
         ("--fps", "30", *SIZE, "--fov", "0"): "fov must be 10 to 150",
     }
     for options, expected in cases.items():

@@ -59,7 +59,7 @@ def test_interrupted_command_continues_after_the_first_run(tmp_path, capsys, mon
     assert "finished runs are stored, repeat the command to continue" in capsys.readouterr().err
     # Other seeds neither use nor delete the stored run, interrupted or not.
     assert main([*words, "--seed", "1"]) == 130
-    assert "nothing was written" in capsys.readouterr().err
+    assert "nothing more was written" in capsys.readouterr().err
     assert main([*words, "--seed", "1"]) == 0
     assert main(words) == 0
     assert calls == [(0, 0), (0, 1), (1, 0), (1, 0), (1, 1), (0, 1)]

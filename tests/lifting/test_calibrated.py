@@ -213,6 +213,34 @@ def test_checks_of_several_views_have_limits_of_their_own(filmed, three):
         assert 0 < result.checks[2].value < limits["proportions"]
 
 
+def test_tracks_of_detections_alone_are_aligned_by_their_frames(filmed):
+    tracks, calibration, _ = filmed
+    starts, stops = (7, 12, 9), (60, 58, 50)
+    whole = [replace(track, start=5) for track in tracks]
+    cut = [
+        replace(
+            track,
+            keypoints=track.keypoints[start - 5 : stop - 5],
+            confidence=track.confidence[start - 5 : stop - 5],
+            start=start,
+        )
+        for track, start, stop in zip(whole, starts, stops, strict=True)
+    ]
+    _, expected = calibrated_views(whole, calibration)
+    _, views = calibrated_views(cut, calibration)
+    for view, full, start, stop in zip(views, expected, starts, stops, strict=True):
+        assert len(view.keypoints.points) == 60 - 7
+        rows = slice(start - 7, stop - 7)
+        for name in ("points", "weight"):
+            got, whole_view = (getattr(each.keypoints, name) for each in (view, full))
+            np.testing.assert_allclose(got[rows], whole_view[start - 5 : stop - 5])
+        outside = np.delete(view.keypoints.weight, rows, axis=0)
+        assert not outside.any()
+    late = replace(cut[1], start=60)
+    with pytest.raises(ValueError, match="frames in common, got first frames 7, 60, 9"):
+        calibrated_views([cut[0], late, cut[2]], calibration)
+
+
 def shortened(track):
     return replace(track, keypoints=track.keypoints[:-1], confidence=track.confidence[:-1])
 

@@ -302,5 +302,6 @@ def _category_skeleton(content: dict[str, Any], path: Path) -> Skeleton | None:
 
 def _described(content: Any) -> str:
     if isinstance(content, dict):
-        return f"the keys {', '.join(key[:40] for key in list(content)[:8])}"
+        keys = ", ".join(key[:40] for key in list(content)[:8])
+        return f"the keys {keys}" if keys else "an empty object"
     return f"a {type(content).__name__} with {shortened(content)}"

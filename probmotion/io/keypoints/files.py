@@ -87,7 +87,7 @@ def open_keypoints(
     Returns
     -------
     file : KeypointFile
-        Format, frame rate and tracks, in pixels.
+        Format, frame rate, tracks in pixels, and image size.
 
     Raises
     ------
@@ -96,7 +96,8 @@ def open_keypoints(
     FileNotFoundError
         If the file does not exist.
     ValueError
-        If ``fps`` is not above 0, or ``skeleton``, ``people`` or ``image_size`` is not applicable.
+        If ``fps`` is not above 0, ``skeleton`` or ``people`` is not applicable, or ``image_size``
+        is not that of the file.
     """
     path = Path(path)
     if not path.exists():
@@ -106,6 +107,23 @@ def open_keypoints(
     if image_size is not None:
         for name, value in zip(("width", "height"), image_size, strict=True):
             check_positive(f"image_size ({name})", value)
+    file = _opened(path, fps, skeleton, people, image_size)
+    if image_size is not None and file.image_size not in (None, tuple(image_size)):
+        raise ValueError(
+            f"image_size must be that of {path}, {file.image_size}, got {tuple(image_size)}; "
+            "leave it out"
+        )
+    return file
+
+
+def _opened(
+    path: Path,
+    fps: float | None,
+    skeleton: Skeleton | str | None,
+    people: int | None,
+    image_size: tuple[float, float] | None,
+) -> KeypointFile:
+    """Return the content of a keypoint file; see :func:`open_keypoints`."""
     wanted = Skeleton.preset(skeleton) if isinstance(skeleton, str) else skeleton
     suffix = "" if path.is_dir() else path.suffix.lower()
     archive, table = suffix == ".npz", suffix in (".csv", *_HDF5)

@@ -17,7 +17,7 @@ from probmotion.io.errors import LARGEST, MotionFileError, shortened
 from probmotion.io.keypoints.tracks import Detection, Parsed
 from probmotion.motion.skeleton import Skeleton
 
-__all__ = ["FRAME", "TIME", "Person", "declared", "matrix_of", "numbered_frames", "value_of"]
+__all__ = ["FRAME", "TIME", "Person", "declared_size", "matrix_of", "numbered_frames", "value_of"]
 
 FRAME = ("frame_id", "frame", "frame_idx", "frame_index", "frame_number")
 """Keys of the number of a frame."""
@@ -47,7 +47,7 @@ def numbered_frames(
     MotionFileError
         If frame numbers or the frame rate are not plausible.
     """
-    fps = declared(header, _FPS, path)
+    fps = _declared(header, _FPS, path)
     numbers = [value_of(entry, FRAME) for entry in entries]
     times = _times(entries)
     numbered = any(value not in (None, -1) for value in numbers)
@@ -78,7 +78,7 @@ def numbered_frames(
         for points, person in people
     ]
     span = {"": range(numbers[0], numbers[-1] + 1)} if numbers else {}
-    return Parsed(name, detections, span, skeleton, fps)
+    return Parsed(name, detections, span, skeleton, fps, declared_size(header, path))
 
 
 def _times(entries: Sequence[Any]) -> np.ndarray:
@@ -94,7 +94,7 @@ def _times(entries: Sequence[Any]) -> np.ndarray:
     return times if (np.diff(times) >= _SHORTEST_STEP).all() else np.empty(0)
 
 
-def declared(header: dict[str, Any], keys: tuple[str, ...], path: Path) -> float | None:
+def _declared(header: dict[str, Any], keys: tuple[str, ...], path: Path) -> float | None:
     """Return a number above 0 of the file's header or of its metadata."""
     inner = [header[key] for key in ("metadata", "meta", "video_info", "video") if key in header]
     for part in [header, *inner]:
@@ -107,6 +107,12 @@ def declared(header: dict[str, Any], keys: tuple[str, ...], path: Path) -> float
                 )
             return float(value)
     return None
+
+
+def declared_size(header: dict[str, Any], path: Path) -> tuple[int, int] | None:
+    """Return the width and height of the file's header or of its metadata."""
+    width, height = _declared(header, ("width",), path), _declared(header, ("height",), path)
+    return None if width is None or height is None else (int(width), int(height))
 
 
 def value_of(entry: Any, keys: tuple[str, ...]) -> Any:

@@ -58,7 +58,7 @@ def keypoint_file(
     rate = parsed.fps if fps is None else fps
     layout = _layout(detections, given, path)
     tracks = tracks_of(detections, parsed.frames, layout, rate, path)
-    return KeypointFile(parsed.format, rate, tracks)
+    return KeypointFile(parsed.format, rate, tracks, parsed.image_size)
 
 
 def _identified(detections: list[Detection]) -> bool:
@@ -78,7 +78,8 @@ def _layout(detections: list[Detection], given: Skeleton | None, path: Path) -> 
             wanted = f"{count} keypoints{_TWO_LAYOUTS.get(count, '')}"
             known = ", ".join(f"{number} ({name})" for number, name in _BY_COUNT.items())
             raise MotionFileError(
-                f"{path}: skeleton must be given for {wanted}, got None; recognised are {known}, "
+                f"{path}: skeleton must be given for {wanted}, got None (--skeleton; see "
+                f"probmotion list); recognised are {known}, 25 (OpenPose), "
                 "133 and 136 (bodies of COCO-WholeBody and Halpe)"
             )
         return Skeleton.preset(_BY_COUNT[count])

@@ -28,7 +28,7 @@ from probmotion.io.keypoints.frames import (
     FRAME,
     TIME,
     Person,
-    declared,
+    declared_size,
     matrix_of,
     numbered_frames,
     value_of,
@@ -158,8 +158,8 @@ def _landmark_frames(
     frames = [list(_landmarks(entry, f"{path}, frame {k}")) for k, entry in enumerate(entries)]
     points = [points[points[:, 2] > 0, :2] for people in frames for points, _ in people]
     if points and np.nanmedian([0.0, *np.abs(np.concatenate(points)).ravel()]) <= _NORMALISED:
-        size = image_size or tuple(declared(header, (key,), path) for key in ("width", "height"))
-        if None in size:
+        size = image_size or declared_size(header, path)
+        if size is None:
             raise MotionFileError(
                 f"{path}: image_size must be given for landmarks normalised to the image, got "
                 "None; pass image_size=(width, height) in pixels (--image-size WIDTH HEIGHT)"

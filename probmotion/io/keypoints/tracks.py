@@ -42,13 +42,14 @@ Frames = dict[str, range]
 
 
 class Parsed(NamedTuple):
-    """Detections of a file and, if it contains them, its frames, skeleton and frame rate."""
+    """Detections of a file and, if it contains them, its frames, skeleton, rate and image size."""
 
     format: str
     detections: list[Detection]
     frames: Frames | None = None
     skeleton: Skeleton | None = None
     fps: float | None = None
+    image_size: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +64,14 @@ class KeypointFile:
         Frames per second; None if neither the file nor the caller has it.
     tracks : list of KeypointTrack
         One per person and camera; of 1 frame per second if ``fps`` is None.
+    image_size : (int, int), optional
+        Width and height of the image, pixels, if the file contains them.
     """
 
     format: str
     fps: float | None
     tracks: list[KeypointTrack]
+    image_size: tuple[int, int] | None = None
 
 
 def keypoint_values(value: Any, where: str) -> np.ndarray:
@@ -126,8 +130,8 @@ def tracks_of(
 ) -> list[KeypointTrack]:
     """Return one track per video and person, sorted by video, then by person.
 
-    Tracks span the ``frames`` of their video, by default from the first to the last detection.
-    Keypoints of missing detections are NaN with confidence 0.
+    Tracks span the ``frames`` of their video, by default from the first to the last detection, of
+    which the first is their ``start``. Keypoints of missing detections are NaN with confidence 0.
     """
     unnamed = sum(detection.person is None for detection in detections)
     if 0 < unnamed < len(detections):
@@ -151,6 +155,7 @@ def tracks_of(
                 f"{got} in frame {detection.frame}; {hint}"
             )
         track[detection.frame] = detection
+    listed = frames is not None
     if frames is None:
         frames = {video: range(min(each), max(each) + 1) for video, each in seen.items()}
 
@@ -164,7 +169,8 @@ def tracks_of(
         values = np.zeros((len(span), skeleton.n_joints, 3))
         for frame, detection in grouped[video, person].items():
             values[span.index(frame)] = detection.values
-        tracks.append(_track(values, skeleton, fps, file, video if len(seen) > 1 else "", person))
+        made = _track(values, skeleton, fps, file, video if len(seen) > 1 else "", person)
+        tracks.append(made if listed else replace(made, start=span[0]))
     return tracks
 
 

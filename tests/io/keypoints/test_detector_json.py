@@ -79,6 +79,15 @@ def test_alphapose_without_tracking(tmp_path):
     ]
 
 
+def test_only_files_of_detections_alone_have_a_first_frame(tmp_path):
+    results = [result(i + 22, FIRST[i], idx=0) for i in range(4)]
+    (track,) = read_keypoints(written(tmp_path, results), fps=25)
+    assert track.start == 22
+    frames = [{"people": [{"pose_keypoints_2d": flat(FIRST[i])}]} for i in range(4)]
+    (track,) = read_keypoints(written(tmp_path, frames), fps=25)
+    assert track.start is None
+
+
 def test_the_same_id_twice_is_not_tracked_anew(tmp_path):
     content = [result(i, FIRST[i], idx=k) for i in range(4) for k in (1, 2)]
     path = written(tmp_path, [*content, result(3, SECOND[3], idx=2)])
@@ -304,7 +313,7 @@ def category(**more):
         ([ONE | {"keypoints": [float("nan"), 2, 1]}], "where confidence is above 0, got NaN"),
         (
             [ONE | {"keypoints": [1, 2, 1] * 5}],
-            "for 5 keypoints, got None; recognised .* 17 .coco17., 18 .openpose18., ",
+            r"for 5 keypoints, got None .--skeleton; see .*17 .coco17., 18 .openpose18., ",
         ),
         ([ONE, result(1, FIRST[0][:5])], r"the same number of keypoints, got \[5, 17\]"),
         ({"people": []}, "expected at least one person, got none"),
