@@ -294,7 +294,7 @@ def category(**more):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ({}, r"expected keypoints of COCO .* got the keys $"),
+        ({}, r"expected keypoints of COCO .* got an empty object$"),
         ([ONE, ONE], "unique track ids .* got two people without track ids in frame 0"),
         ([openpose(FIRST[0], SECOND[0], person_id=[-1])], "two people without track ids"),
         ([ONE, result(0, FIRST[0], idx=1)], "track id for all .* or none, got 1 of 2 without"),
