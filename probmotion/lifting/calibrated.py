@@ -185,13 +185,7 @@ class _Recording(NamedTuple):
 
     def mirrored(self) -> _Recording:
         """Return the recording with left and right exchanged."""
-        order = list(PERSON.mirrored_order)
-        return self._replace(
-            views=[
-                view._replace(points=view.points[:, order], weight=view.weight[:, order])
-                for view in self.views
-            ]
-        )
+        return self._replace(views=[view.mirrored() for view in self.views])
 
     def posterior(self, start: int, noise: float, candidates: int = 3) -> WindowPosterior:
         """Return the posterior of the window from a frame on."""

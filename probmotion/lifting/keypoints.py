@@ -55,6 +55,11 @@ class PersonKeypoints(NamedTuple):
     weight: np.ndarray
     swapped: float
 
+    def mirrored(self) -> PersonKeypoints:
+        """Return the keypoints with left and right exchanged."""
+        order = list(PERSON.mirrored_order)
+        return self._replace(points=self.points[:, order], weight=self.weight[:, order])
+
 
 def person_keypoints(track: KeypointTrack) -> PersonKeypoints:
     """Return a track's keypoints of arms and legs; raises ``ValueError`` if there are too few."""

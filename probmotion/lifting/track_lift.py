@@ -15,7 +15,6 @@ from probmotion.lifting.camera import LevelCamera
 from probmotion.lifting.checks import MEDIAN, Check, Evidence, checked, uncertain
 from probmotion.lifting.keypoints import (
     LIMBS,
-    PERSON,
     BodyPath,
     PersonKeypoints,
     averaged,
@@ -84,9 +83,7 @@ class _Windows(NamedTuple):
 
     def mirrored(self) -> _Windows:
         """Return the windows with left and right exchanged."""
-        order = list(PERSON.mirrored_order)
-        points, weight, swapped = self.keypoints
-        exchanged = PersonKeypoints(points[:, order], weight[:, order], swapped)
+        exchanged = self.keypoints.mirrored()
         depths = _depths(exchanged, self.path, self.prior.fps)
         return self._replace(keypoints=exchanged, depths=depths)
 
