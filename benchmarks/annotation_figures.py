@@ -145,7 +145,7 @@ def physical_figures(pairs: Pairs) -> Figures:
     2018, mean over views, of 300 draws) and ``root_distance`` are medians, also of the held-out
     pairs. ``rhat`` is the median, over 20 annotations, of the largest R-hat of a coordinate, with
     four chains of 40 draws, and ``largest_rhat`` the largest. ``agreement`` is the share of these
-    annotations on which two such runs agree as those of references must.
+    annotations on which two such runs agree within the limits for references.
     """
     prior, drawn = pairs.fitted(pairs.all)[0], pairs.annotated(2000, seed=1)
     physics = PosePairPrior(pairs.start, Skeleton.preset("pair17"))

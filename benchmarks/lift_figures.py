@@ -160,9 +160,11 @@ def other_views(folder: Path) -> Iterator[tuple[str, float]]:
 def feet(result: Lift, video: Video) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return heights and speeds of ankles in all frames in which they stand.
 
-    First, whether an ankle of the exported motion is within 2 cm of their median height, where the
-    true ones stand, and of its height on the floor y = 0, where the lifted ones stand; then the
-    speed of the lifted ankle where the true one stands, metres per second.
+    - Where a true ankle stands: whether that of the exported motion is within 2 cm of the median of
+      these heights.
+    - Where a lifted ankle stands: whether that of the exported motion is within 2 cm of the height
+      at which ankles stand on the floor y = 0.
+    - Where a true ankle stands: the speed of the lifted one, metres per second.
     """
     fps = video.motion.fps
     true, mean, rigid = (

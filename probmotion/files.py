@@ -7,6 +7,7 @@ import json
 import os
 import platform
 import re
+import shutil
 import sys
 import tempfile
 import zipfile
@@ -96,12 +97,13 @@ def write_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        reason = error.strerror or str(error)
+        # The error may be one of a file in the folder ``path``.
+        reason = getattr(error.__cause__, "strerror", None) or error.strerror or str(error)
         raise OSError(f"cannot write {path}: {reason}; choose a writable folder") from error
 
 
 def forget_killed(folder: Path) -> None:
-    """Remove temporary files in ``folder`` written by killed processes of this machine.
+    """Remove temporary files and folders in ``folder`` of killed processes of this machine.
 
     Files of other machines that share the folder are preserved: their processes may still run.
     """
@@ -111,8 +113,11 @@ def forget_killed(folder: Path) -> None:
     for path in folder.iterdir():
         match = _UNFINISHED.fullmatch(path.name)
         if match and not _is_running(int(match[1])):
-            with suppress(OSError):
-                path.unlink()
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                with suppress(OSError):
+                    path.unlink()
 
 
 def _is_running(process: int) -> bool:
@@ -144,7 +149,7 @@ def writable_folder(folder: Path, name: str = "out") -> Path:
 def written_together(folder: Path) -> Iterator[Path]:
     """Yield a temporary folder; move its files to ``folder`` once the block succeeds.
 
-    Otherwise ``folder`` is as before, or does not exist if it did not.
+    If it fails, ``folder`` is as before, or does not exist if it did not.
 
     Raises
     ------
@@ -152,9 +157,14 @@ def written_together(folder: Path) -> Iterator[Path]:
         If ``folder``, the argument ``out`` of a command, is not writable.
     """
     missing = [path for path in (folder, *folder.parents) if not os.path.exists(path)]
+    suffix = f".{_MACHINE}.{os.getpid()}.unfinished"
     try:
         writable_folder(folder)
-        with tempfile.TemporaryDirectory(prefix=".unfinished-", dir=folder) as unfinished:
+        forget_killed(folder)
+        with (
+            tempfile.TemporaryDirectory(prefix=".", suffix=suffix, dir=folder) as unfinished,
+            write_errors(folder),
+        ):
             yield Path(unfinished)
             for path in sorted(Path(unfinished).iterdir()):
                 os.replace(path, folder / path.name)

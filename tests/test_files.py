@@ -1,3 +1,6 @@
+import os
+import re
+
 import pytest
 
 from probmotion.files import check_writable, written_together
@@ -40,3 +43,24 @@ def test_files_are_written_together_or_not_at_all(tmp_path):
         "other.txt": "0",
         "second.txt": "1",
     }
+
+
+def test_errors_of_files_written_together_name_the_folder(tmp_path):
+    def clash():
+        with written_together(tmp_path) as unfinished:
+            (unfinished / "file").write_text("1", encoding="utf-8")
+            (unfinished / "missing" / "file").write_text("1", encoding="utf-8")
+
+    message = f"cannot write {tmp_path}: No such file or directory; choose a writable folder"
+    with pytest.raises(OSError, match=f"^{re.escape(message)}$"):
+        clash()
+    assert not any(tmp_path.iterdir())
+
+
+def test_folders_of_killed_writers_are_removed(tmp_path):
+    with written_together(tmp_path) as unfinished:
+        left = unfinished.name.replace(f".{os.getpid()}.", f".{2**22 + 1}.")
+    (tmp_path / left).mkdir()
+    (tmp_path / left / "file").write_text("1", encoding="utf-8")
+    check_writable(tmp_path)
+    assert not any(tmp_path.iterdir())

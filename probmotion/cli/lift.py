@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Lift", "Reconstruct"]
 
-_RATE_ERROR = 0.05  # of frame rates from rounded timestamps, relative
+_RATE_ERROR = 0.01  # of frame rates that are rounded, or from rounded timestamps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,14 +79,22 @@ class Lift:
         from probmotion.files import check_writable
         from probmotion.lifting.recording_lift import lift
 
-        files = self._files()
-        size = self.image_size or files[0].image_size
-        if size is None and self.camera is None:
+        paths = self._paths()
+        if len(paths) > 1 and self.person is not None:
             raise ValueError(
-                "--image-size or --camera must be given, got neither; --image-size 1920 1080 is a "
-                "video of this width and height"
+                "--person must not be given with several cameras, whose people may have other "
+                f"numbers, got {self.person}; associate people before (pose-associated of Pose2Sim)"
             )
-        people = self._people(files)
+        files = [self._file(path) for path in paths]
+        size = self.image_size
+        if self.camera is None:
+            size = size or files[0].image_size
+            if size is None:
+                raise ValueError(
+                    "--image-size or --camera must be given, got neither; --image-size 1920 1080 "
+                    "is a video of this width and height"
+                )
+        people = self._people(paths, files)
         check_writable(self.out)
         doubtful, refused = [], []
         for number, tracks in enumerate(people):
@@ -94,7 +102,7 @@ class Lift:
             try:
                 result = lift(
                     tracks,
-                    image_size=size if self.camera is None else self.image_size,
+                    image_size=size,
                     camera=self.camera,
                     fov=self.fov,
                     pitch=self.pitch,
@@ -126,45 +134,39 @@ class Lift:
                 f"{', '.join(doubtful)}; see lift.html"
             )
 
-    def _files(self) -> list[KeypointFile]:
-        """Return the content of the file of every camera, whose tracks are named after it."""
+    def _paths(self) -> list[Path]:
+        """Return the file or folder of every camera."""
         from probmotion.io.keypoints.calibration import view_folders
 
         paths = list(self.keypoints)
         if not paths:
             raise ValueError("KEYPOINTS must be a file or folder of a detector, got none")
         if self.camera is not None and len(paths) == 1:
-            paths = view_folders(paths[0])
+            return view_folders(paths[0])
         if self.camera is None and len(paths) > 1:
             raise ValueError(f"--camera must be given for several files, got {len(paths)} files")
-        if len(paths) > 1 and self.person is not None:
-            raise ValueError(
-                "--person must not be given with several cameras, whose people may have other "
-                f"numbers, got {self.person}; associate people before (pose-associated of Pose2Sim)"
-            )
-        return [self._file(path) for path in paths]
+        return paths
 
     def _file(self, path: Path) -> KeypointFile:
-        """Return the content of a file, with the given frame rate if it has none."""
+        """Return the content of a file."""
         from probmotion.io.keypoints.files import open_keypoints
 
-        file = open_keypoints(path, None, self.skeleton, self.people, self.image_size)
-        fps = self.fps or file.fps
-        if fps is None:
+        file = open_keypoints(path, self.fps, self.skeleton, self.people, self.image_size)
+        if file.fps is None:
             raise ValueError(
                 f"--fps must be given for {path}, which contains no frame rate, got none; --fps 30 "
                 "is a video of 30 frames per second"
             )
-        if file.fps is not None and abs(fps / file.fps - 1) > _RATE_ERROR:
+        if file.declared_fps and abs(file.fps / file.declared_fps - 1) > _RATE_ERROR:
             raise ValueError(
-                f"--fps must be the frame rate of {path}, {file.fps:g}, got {fps:g}; leave it out"
+                f"--fps must be the frame rate of {path}, {file.declared_fps:g}, got {self.fps:g}; "
+                "leave it out"
             )
-        tracks = [replace(track, fps=fps) for track in file.tracks]
-        if self.camera is not None:
-            tracks = [replace(track, name=path.stem) for track in tracks]
-        return replace(file, fps=fps, tracks=tracks)
+        if self.camera is None:
+            return file
+        return replace(file, tracks=[replace(track, name=path.stem) for track in file.tracks])
 
-    def _people(self, files: list[KeypointFile]) -> list[list[KeypointTrack]]:
+    def _people(self, paths: list[Path], files: list[KeypointFile]) -> list[list[KeypointTrack]]:
         """Return the tracks of every person, one a camera."""
         if len(files) == 1:
             tracks = files[0].tracks
@@ -174,12 +176,11 @@ class Lift:
                 people = "a single person, 0" if len(tracks) == 1 else f"0 to {len(tracks) - 1}"
                 raise ValueError(f"--person must be {people}, got {self.person}")
             return [[tracks[self.person]]]
-        for file in files:
+        for path, file in zip(paths, files, strict=True):
             if len(file.tracks) != 1:
                 raise ValueError(
                     f"keypoints of several cameras must be of one person, got {len(file.tracks)} "
-                    f"in {file.tracks[0].name}; associate people before (pose-associated of "
-                    "Pose2Sim)"
+                    f"in {path}; associate people before (pose-associated of Pose2Sim)"
                 )
         return [[file.tracks[0] for file in files]]
 

@@ -95,21 +95,23 @@ def calibrated_views(
     if len(tracks) > _MOST:
         raise ValueError(f"tracks must be of at most {_MOST} cameras, got {len(tracks)}")
     found = calibration.matched([track.name for track in tracks])
+    _check_same("frame rate", [track.fps for track in tracks])
     tracks = _in_step(tracks)
-    for what, values in (
-        ("number of frames", [track.frames for track in tracks]),
-        ("frame rate", [track.fps for track in tracks]),
-    ):
-        if len(set(values)) > 1:
-            raise ValueError(
-                f"tracks of all cameras must have the same {what}, got "
-                f"{', '.join(f'{value:g}' for value in values)}; synchronise the videos"
-            )
+    _check_same("number of frames", [track.frames for track in tracks])
     return found, [_view(track, calibration, v) for track, v in zip(tracks, found, strict=True)]
 
 
+def _check_same(what: str, values: Sequence[float]) -> None:
+    """Refuse tracks that differ."""
+    if len(set(values)) > 1:
+        raise ValueError(
+            f"tracks of all cameras must have the same {what}, got "
+            f"{', '.join(f'{value:g}' for value in values)}; synchronise the videos"
+        )
+
+
 def _in_step(tracks: Sequence[KeypointTrack]) -> Sequence[KeypointTrack]:
-    """Return tracks of the same frames, if all end where detections end."""
+    """Return tracks with the frames of all, if they have frame numbers."""
     starts = [track.start for track in tracks if track.start is not None]
     if len(starts) < len(tracks):
         return tracks

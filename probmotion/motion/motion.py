@@ -253,8 +253,8 @@ class KeypointTrack:
     name : str
         Name of the track.
     start : int, optional
-        Number of the first frame in the video, if the track ends where detections end. Synchronised
-        tracks are padded by it; others must have all frames.
+        Number of the first frame in the video, for example if the track spans the first to the last
+        detection. Synchronised tracks are aligned by it; those without must have all frames.
 
     Raises
     ------
@@ -289,6 +289,8 @@ class KeypointTrack:
                 f"frame {frame}, joint {joint} with confidence {confidence[frame, joint]:g}"
             )
         check_positive("fps", self.fps)
+        if self.start is not None:
+            check_count("start", self.start, least=0)
         object.__setattr__(self, "keypoints", keypoints)
         object.__setattr__(self, "confidence", confidence)
 

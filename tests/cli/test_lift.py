@@ -80,7 +80,8 @@ def test_rate_and_size_of_the_file_are_used_and_must_not_be_contradicted(
 ):
     out = tmp_path / "out"
     words = ["lift", str(landmarks), "--draws", "2", "--out", str(out)]
-    assert "--fps must be the frame rate of" in fails(*words, "--fps", "60")
+    assert "--fps must be the frame rate of" in fails(*words, "--fps", "31")
+    assert "fps must be a finite number above 0, got 0" in fails(*words, "--fps", "0")
     message = fails(*words, "--image-size", "1920", "1080")
     assert "walk.json, (1000, 1000), got (1920, 1080); leave it out" in message
     assert not out.exists()

@@ -58,6 +58,7 @@ def split_discontinuities(
                     keypoints=track.keypoints[start:stop],
                     confidence=track.confidence[start:stop],
                     name=name_within_clip(track.name, str(number)) if len(cuts) else track.name,
+                    start=None,
                 )
             )
     why = (

@@ -104,6 +104,7 @@ def _resampled(track: KeypointTrack, fps: float) -> KeypointTrack:
         keypoints=np.where(visible[..., np.newaxis], keypoints, np.nan),
         confidence=np.where(visible, confidence, 0.0),
         fps=fps,
+        start=None,
     )
 
 

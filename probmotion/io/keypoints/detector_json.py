@@ -39,6 +39,7 @@ from typing import Any
 import numpy as np
 
 from probmotion.io.errors import MotionFileError, read_bytes, shortened
+from probmotion.io.keypoints.frames import declared_size
 from probmotion.io.keypoints.layouts import keypoint_file
 from probmotion.io.keypoints.mediapipe import read_landmarks
 from probmotion.io.keypoints.mmpose import read_mmpose
@@ -154,7 +155,9 @@ def _annotations(content: dict[str, Any], path: Path) -> Parsed:
         detections.append(Detection(*locations[image_id], track_id, values, where))
     frames = {video: range(count) for video, count in length.items()}
     skeleton = _category_skeleton(content, path)
-    return Parsed("COCO annotations", detections, frames, skeleton)
+    sizes = {declared_size(image, path) for image in images}
+    size = sizes.pop() if len(sizes) == 1 else None
+    return Parsed("COCO annotations", detections, frames, skeleton, image_size=size)
 
 
 def _results(content: list[dict[str, Any]], path: Path) -> Parsed:

@@ -82,7 +82,7 @@ def open_keypoints(
         :func:`~probmotion.io.keypoints.tracks.link_people`.
     image_size : (float, float), optional
         Width and height of the image in pixels; required for normalised landmarks of MediaPipe,
-        unless the file contains it, and without effect on keypoints in pixels.
+        unless the file contains it. Files in pixels do not need it.
 
     Returns
     -------

@@ -78,7 +78,8 @@ def numbered_frames(
         for points, person in people
     ]
     span = {"": range(numbers[0], numbers[-1] + 1)} if numbers else {}
-    return Parsed(name, detections, span, skeleton, fps, declared_size(header, path))
+    size = declared_size(header, path)
+    return Parsed(name, detections, span, skeleton, fps, size, numbered)
 
 
 def _times(entries: Sequence[Any]) -> np.ndarray:

@@ -57,8 +57,8 @@ def keypoint_file(
             detections = link_people(detections, people)
     rate = parsed.fps if fps is None else fps
     layout = _layout(detections, given, path)
-    tracks = tracks_of(detections, parsed.frames, layout, rate, path)
-    return KeypointFile(parsed.format, rate, tracks, parsed.image_size)
+    tracks = tracks_of(detections, parsed.frames, layout, rate, path, parsed.numbered)
+    return KeypointFile(parsed.format, rate, tracks, parsed.image_size, parsed.fps)
 
 
 def _identified(detections: list[Detection]) -> bool:

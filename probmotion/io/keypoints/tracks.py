@@ -42,7 +42,10 @@ Frames = dict[str, range]
 
 
 class Parsed(NamedTuple):
-    """Detections of a file and, if it contains them, its frames, skeleton, rate and image size."""
+    """Detections of a file and, if it contains them, its frames, skeleton, rate and image size.
+
+    ``numbered``: the numbers of ``frames`` are those of the video.
+    """
 
     format: str
     detections: list[Detection]
@@ -50,6 +53,7 @@ class Parsed(NamedTuple):
     skeleton: Skeleton | None = None
     fps: float | None = None
     image_size: tuple[int, int] | None = None
+    numbered: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,12 +70,15 @@ class KeypointFile:
         One per person and camera; of 1 frame per second if ``fps`` is None.
     image_size : (int, int), optional
         Width and height of the image, pixels, if the file contains them.
+    declared_fps : float, optional
+        Frames per second according to a JSON or CSV file.
     """
 
     format: str
     fps: float | None
     tracks: list[KeypointTrack]
     image_size: tuple[int, int] | None = None
+    declared_fps: float | None = None
 
 
 def keypoint_values(value: Any, where: str) -> np.ndarray:
@@ -127,11 +134,13 @@ def tracks_of(
     skeleton: Skeleton,
     fps: float | None,
     file: Path,
+    numbered: bool = False,
 ) -> list[KeypointTrack]:
     """Return one track per video and person, sorted by video, then by person.
 
-    Tracks span the ``frames`` of their video, by default from the first to the last detection, of
-    which the first is their ``start``. Keypoints of missing detections are NaN with confidence 0.
+    Tracks span the ``frames`` of their video, by default from the first to the last detection. The
+    first is their ``start`` by default, or if ``frames`` are ``numbered``. Keypoints of
+    missing detections are NaN with confidence 0.
     """
     unnamed = sum(detection.person is None for detection in detections)
     if 0 < unnamed < len(detections):
@@ -155,7 +164,7 @@ def tracks_of(
                 f"{got} in frame {detection.frame}; {hint}"
             )
         track[detection.frame] = detection
-    listed = frames is not None
+    numbered = numbered or frames is None
     if frames is None:
         frames = {video: range(min(each), max(each) + 1) for video, each in seen.items()}
 
@@ -170,7 +179,7 @@ def tracks_of(
         for frame, detection in grouped[video, person].items():
             values[span.index(frame)] = detection.values
         made = _track(values, skeleton, fps, file, video if len(seen) > 1 else "", person)
-        tracks.append(made if listed else replace(made, start=span[0]))
+        tracks.append(replace(made, start=span[0]) if numbered else made)
     return tracks
 
 

@@ -79,13 +79,17 @@ def test_alphapose_without_tracking(tmp_path):
     ]
 
 
-def test_only_files_of_detections_alone_have_a_first_frame(tmp_path):
+def test_tracks_of_files_that_number_frames_have_a_first_frame(tmp_path):
     results = [result(i + 22, FIRST[i], idx=0) for i in range(4)]
     (track,) = read_keypoints(written(tmp_path, results), fps=25)
     assert track.start == 22
+    instance = {"keypoints": FIRST[0, :, :2].tolist(), "keypoint_scores": FIRST[0, :, 2].tolist()}
     frames = [{"people": [{"pose_keypoints_2d": flat(FIRST[i])}]} for i in range(4)]
     (track,) = read_keypoints(written(tmp_path, frames), fps=25)
     assert track.start is None
+    frames = [{"frame_id": i + 7, "instances": [instance]} for i in range(4)]
+    (track,) = read_keypoints(written(tmp_path, frames), fps=25)
+    assert track.start == 7
 
 
 def test_the_same_id_twice_is_not_tracked_anew(tmp_path):
