@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from probmotion.io.errors import MotionFileError
-from probmotion.io.keypoints.files import read_keypoints
+from probmotion.io.keypoints.files import open_keypoints, read_keypoints
 from probmotion.io.keypoints.tracks import natural
 from probmotion.motion.skeleton import Skeleton
 
@@ -204,6 +204,10 @@ def test_coco_annotations_and_visibilities(tmp_path):
     assert first.confidence[0, [3, 4, 5]].tolist() == [0.5, 0, 1]
     np.testing.assert_array_equal(first.keypoints[[0, 1], [3, 0]], [[4, 5], FIRST[1, 0, :2]])
     np.testing.assert_array_equal(second.keypoints[0, 0], FIRST[2, 0, :2])
+    images = [image | {"width": 640, "height": 480} for image in coco()["images"]]
+    assert open_keypoints(written(tmp_path, coco(images=images))).image_size == (640, 480)
+    images[0]["width"] = 480
+    assert open_keypoints(written(tmp_path, coco(images=images))).image_size is None
 
 
 def test_coco_categories_define_the_skeleton(tmp_path):
