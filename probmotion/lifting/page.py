@@ -70,7 +70,7 @@ def lift_page(
         motion.skeleton, motion.fps, True, camera=cameras.view(view), keypoints=keypoints[view]
     )
     rows = {"lift": np.concatenate([motion.positions[None], shown_draws])}
-    shown = Shown(problem, rows, step, overlaid=True)
+    shown = Shown(problem, rows, step, overlaid=True, floor=0.0)
     caption = (
         f"mean and {min(3, len(draws))} draws; joints coloured by the standard deviation of "
         f"{len(shown_draws)} draws"

@@ -37,7 +37,7 @@ class Shown:
     motions are rotated to a common heading and single poses are aligned with the first pose. If
     ``overlaid``, draws of a row are shown on top of each other, and colours of the first draw are
     standard deviations over all draws, or those of ``sds`` (L, J, 3) by label, metres; the first
-    two rows determine the scale.
+    two rows determine the scale. The ``floor`` is at the lowest joint or at a height, metres.
     """
 
     problem: StoredProblem
@@ -46,6 +46,7 @@ class Shown:
     turned: bool = True
     overlaid: bool = False
     sds: Mapping[str, np.ndarray] = field(default_factory=dict)
+    floor: float | None = None
 
     @property
     def frames(self) -> int:
@@ -109,6 +110,8 @@ def motion_numbers(shown: Shown) -> dict[str, Any]:
         "camera": None,
         **_extent(np.concatenate(scaling if truth is None else [*scaling, truth[None]])),
     }
+    if shown.floor is not None:
+        data["low"] = shown.floor
     if path is not None and problem.joints is not None:
         data["dots"] = _base64((problem.joints[::step] - path[:, None]).astype("<f4"))
     if path is not None and problem.camera is not None:

@@ -1,4 +1,5 @@
 import json
+import re
 
 import numpy as np
 import pytest
@@ -38,6 +39,8 @@ def test_the_page_loads_nothing_and_escapes_names(lifted, tmp_path):
     assert "<script>alert" not in text
     assert "default-src 'none'" in text
     assert lifted.summary()[1] in text
+    (data,) = re.findall(r'<script type="application/json">(.*?)</script>', text)
+    assert json.loads(data)["low"] == 0  # the floor, which no joint touches
 
 
 def test_other_suffixes_are_refused(lifted, tmp_path):
