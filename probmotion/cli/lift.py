@@ -118,6 +118,8 @@ class Lift:
                 continue
             result.save(folder)
             print("\n".join(result.summary()))
+            if first := min(track.start or 0 for track in tracks):
+                print(f"Frame 0 of the motion is frame {first} of the video.")
             print(
                 f"wrote {folder / 'lift.html'}, lift.bvh, lift.glb, lift.npz, lift.smpl22.npz, "
                 "summary.json"

@@ -48,11 +48,15 @@ def test_every_person_has_a_folder(capsys, detections, tmp_path):
 def test_people_who_are_hardly_visible_are_named(capsys, fails, detections, tmp_path):
     results = json.loads(detections.read_text(encoding="utf-8"))
     few = [each for each in results if each["idx"] == 0 or int(each["image_id"][:-4]) % 5 == 0]
+    for each in few:
+        each["image_id"] = f"{int(each['image_id'][:-4]) + 22}.jpg"
     path = tmp_path / "few.json"
     path.write_text(json.dumps(few), encoding="utf-8")
     out = tmp_path / "out"
     assert main(["lift", str(path), "--fps", "30", *SIZE, "--draws", "2", "--out", str(out)]) == 0
-    assert "person 1 was not lifted: track must show the person" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert "person 1 was not lifted: track must show the person" in text
+    assert text.count("Frame 0 of the motion is frame 22 of the video") == 1
     assert [folder.name for folder in out.iterdir()] == ["person-0"]
     strict = ["--strict", "--draws", "2", "--out", str(tmp_path / "strict")]
     assert "track must show the person" in fails("lift", str(path), "--fps", "30", *SIZE, *strict)
