@@ -169,7 +169,7 @@ def feet(result: Lift, video: Video) -> tuple[np.ndarray, np.ndarray, np.ndarray
     fps = video.motion.fps
     true, mean, rigid = (
         motion.positions[:, ANKLES]
-        for motion in (video.motion, result.mean, rigid_motion(result.mean))
+        for motion in (video.motion, result.mean, rigid_motion(result.on_floor))
     )
     stands = standing(true, fps)
     heights, own = rigid[stands][:, 1], rigid[standing(mean, fps)][:, 1]

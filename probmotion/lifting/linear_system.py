@@ -19,7 +19,7 @@ from probmotion.lifting.window_prior import WindowPrior
 
 __all__ = [
     "PROPORTIONS", "Ankles", "EstimatedDepths", "LinearKeypoints", "Solution",
-    "depth_rows", "floor_rows", "linear_system",
+    "depth_rows", "floor_rows", "linear_system", "standing_ankles",
 ]  # fmt: skip
 
 PROPORTIONS = 0.03
@@ -86,6 +86,16 @@ class Ankles:
         """Return the probabilities of standing, which are the expected precisions."""
         odds: np.ndarray = _ODDS * np.exp(-squares / 2)
         return odds / (1 + odds)
+
+
+def standing_ankles(ankles: np.ndarray, fps: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return how much higher than on the floor y = 0 ankles (L, 2, 3) are, and whether they stand.
+
+    Heights are in metres; of standing, it is the probability, (L, 2).
+    """
+    speed = np.linalg.norm(np.gradient(ankles, 1 / fps, axis=0), axis=-1)
+    height = ankles[..., 1] - _ANKLE
+    return height, Ankles.standing((speed / _SLOW) ** 2 + (height / _RISE) ** 2)
 
 
 class Solution(NamedTuple):

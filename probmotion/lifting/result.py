@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -16,7 +16,8 @@ from probmotion.io.npz import write_npz
 from probmotion.io.smpl import smpl_motion
 from probmotion.lifting.camera import LevelCamera
 from probmotion.lifting.checks import Check
-from probmotion.lifting.keypoints import LIMBS, from_hips
+from probmotion.lifting.keypoints import ANKLES, LIMBS, from_hips
+from probmotion.lifting.linear_system import standing_ankles
 from probmotion.lifting.page import lift_page
 from probmotion.motion.inverse_kinematics import rigid_motion
 from probmotion.motion.motion import Motion
@@ -24,6 +25,8 @@ from probmotion.motion.motion import Motion
 __all__ = ["Lift"]
 
 _BLOCK = 1000  # frames
+_AROUND = 0.25  # seconds around a frame in which standing feet tell the floor's height
+_AWAY = 0.04  # of the weight of an ankle that surely stands, that of the estimated floor
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +77,29 @@ class Lift:
             rows = slice(first, first + _BLOCK)
             deviation[rows] = from_hips(self.draws[:, rows]).std(axis=0, ddof=1)
         return deviation
+
+    @property
+    def on_floor(self) -> Motion:
+        """The mean, raised or lowered so that feet which stand do so on the floor, for animation.
+
+        With one camera, the depth of a person is uncertain by a few percent, and so is the height
+        of the feet. The shift is the mean of the heights of ankles above the standing height of 7.5
+        cm, weighted by the probabilities that they stand, within about .25 s. With several cameras
+        it is 0.
+        """
+        if self.cameras.n_views > 1:
+            return self.mean
+        from scipy.ndimage import gaussian_filter1d
+
+        height, standing = standing_ankles(self.mean.positions[:, ANKLES], self.mean.fps)
+        total, weight = (
+            gaussian_filter1d(values.sum(axis=1), _AROUND * self.mean.fps, mode="nearest")
+            for values in (standing * height, standing)
+        )
+        shift = total / (weight + _AWAY)
+        positions = self.mean.positions.copy()
+        positions[..., 1] -= shift[:, None]
+        return replace(self.mean, positions=positions)
 
     @property
     def camera(self) -> LevelCamera:
@@ -152,11 +178,12 @@ class Lift:
         return path
 
     def save(self, folder: str | Path) -> None:
-        """Write the page, the mean as BVH, GLB and on SMPL's joints, all draws, and a summary.
+        """Write the page, the motion as BVH, GLB and on SMPL's joints, all draws, and a summary.
 
-        The files are ``lift.html``, ``lift.bvh``, ``lift.glb``, ``lift.npz`` (mean, standard
-        deviations and draws), ``lift.smpl22.npz``
-        (:func:`~probmotion.io.smpl.smpl_motion` of the mean) and ``summary.json``.
+        The files are ``lift.html``, ``lift.bvh``, ``lift.glb`` (rigid bones), ``lift.npz`` (mean,
+        standard deviations and draws), ``lift.smpl22.npz``
+        (:func:`~probmotion.io.smpl.smpl_motion`) and ``summary.json``. Files for animation have
+        the motion :attr:`on_floor`.
         """
         with written_together(Path(folder)) as unfinished:
             self._write(unfinished)
@@ -164,10 +191,10 @@ class Lift:
     def _write(self, folder: Path) -> None:
         """Write the files of :meth:`save`."""
         self.report(folder / "lift.html")
-        rigid = rigid_motion(self.mean)
+        rigid = rigid_motion(self.on_floor)
         save(rigid, folder / "lift.bvh")
         save(rigid, folder / "lift.glb")
-        save(smpl_motion(self.mean), folder / "lift.smpl22.npz")
+        save(smpl_motion(self.on_floor), folder / "lift.smpl22.npz")
         write_npz(self.mean, folder / "lift.npz", {"sd": self.sd, "draws": self.draws})
         content = {
             "trusted": self.trusted,

@@ -1,11 +1,12 @@
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from probmotion.io.files import load
-from probmotion.lifting.keypoints import PERSON
+from probmotion.lifting.keypoints import ANKLES, PERSON
 from probmotion.motion.skeleton import Skeleton
 
 
@@ -31,9 +32,19 @@ def test_a_lift_is_saved(lifted, tmp_path):
     assert np.linalg.norm(moved, axis=-1).mean() < 0.015
 
 
-def test_the_page_loads_nothing_and_escapes_names(lifted, tmp_path):
-    from dataclasses import replace
+def test_standing_feet_are_put_on_the_floor(lifted):
+    still = np.repeat(lifted.mean.positions[:1], 60, axis=0)
+    still[:, ANKLES, 1] = 0.095
+    steps = 0.1 * np.arange(60)[:, None, None] * [1.0, 0.0, 0.0]  # 3 m/s
+    up = np.array([0.0, 0.5, 0.0])
+    for positions, lower in ((still, 0.02), (still + steps, 0.0), (still + up, 0.0)):
+        given = replace(lifted, mean=replace(lifted.mean, positions=positions))
+        moved = positions - given.on_floor.positions
+        assert (moved[..., [0, 2]] == 0).all()
+        np.testing.assert_allclose(moved[..., 1], lower, atol=5e-4)
 
+
+def test_the_page_loads_nothing_and_escapes_names(lifted, tmp_path):
     named = replace(lifted, mean=replace(lifted.mean, name="<script>alert(1)</script>"))
     text = named.report(tmp_path / "page.html").read_text(encoding="utf-8")
     assert "<script>alert" not in text
