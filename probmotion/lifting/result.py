@@ -25,8 +25,8 @@ from probmotion.motion.motion import Motion
 __all__ = ["Lift"]
 
 _BLOCK = 1000  # frames
-_AROUND = 0.25  # seconds around a frame in which standing feet tell the floor's height
-_AWAY = 0.04  # of the weight of an ankle that surely stands, that of the estimated floor
+_AROUND = 0.25  # standard deviation of the kernel over time, seconds
+_UNMOVED = 0.04  # weight of a shift of 0, relative to that of an ankle that certainly stands
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +80,7 @@ class Lift:
 
     @property
     def on_floor(self) -> Motion:
-        """The mean, raised or lowered so that feet which stand do so on the floor, for animation.
+        """The mean, raised or lowered so that standing feet are on the floor, for animation.
 
         With one camera, the depth of a person is uncertain by a few percent, and so is the height
         of the feet. The shift is the mean of the heights of ankles above the standing height of 7.5
@@ -96,7 +96,7 @@ class Lift:
             gaussian_filter1d(values.sum(axis=1), _AROUND * self.mean.fps, mode="nearest")
             for values in (standing * height, standing)
         )
-        shift = total / (weight + _AWAY)
+        shift = total / (weight + _UNMOVED)
         positions = self.mean.positions.copy()
         positions[..., 1] -= shift[:, None]
         return replace(self.mean, positions=positions)
@@ -191,10 +191,11 @@ class Lift:
     def _write(self, folder: Path) -> None:
         """Write the files of :meth:`save`."""
         self.report(folder / "lift.html")
-        rigid = rigid_motion(self.on_floor)
+        on_floor = self.on_floor
+        rigid = rigid_motion(on_floor)
         save(rigid, folder / "lift.bvh")
         save(rigid, folder / "lift.glb")
-        save(smpl_motion(self.on_floor), folder / "lift.smpl22.npz")
+        save(smpl_motion(on_floor), folder / "lift.smpl22.npz")
         write_npz(self.mean, folder / "lift.npz", {"sd": self.sd, "draws": self.draws})
         content = {
             "trusted": self.trusted,
