@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
@@ -66,6 +66,12 @@ class Lift:
     height: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
     """Height of the person, metres; 1.7 ± .1 by default."""
 
+    flip: Annotated[Literal["x", "y", "xy"] | None, arg(metavar="AXES", help_behavior_hint="")] = (
+        None
+    )
+    """Mirror coordinates of the keypoints: y if y points up, xy if the video is upside down, x if
+    it is mirrored but left and right joints are not."""
+
     draws: int = 100
     """Number of posterior draws."""
 
@@ -94,6 +100,14 @@ class Lift:
                     "--image-size or --camera must be given, got neither; --image-size 1920 1080 "
                     "is a video of this width and height"
                 )
+            if self.flip is not None:
+                tracks = [track.flipped(self.flip, size) for track in files[0].tracks]
+                files = [replace(files[0], tracks=tracks)]
+        elif self.flip is not None:
+            raise ValueError(
+                f"--flip must not be given with --camera, got {self.flip}; calibrations are of "
+                "upright keypoints"
+            )
         people = self._people(paths, files)
         check_writable(self.out)
         doubtful, refused = [], []

@@ -15,7 +15,7 @@ import numpy as np
 
 from probmotion.io.keypoints.calibration import Calibration
 from probmotion.lifting.camera import LevelCamera, LevelCameras
-from probmotion.lifting.checks import MEDIAN, Check, Evidence, checked
+from probmotion.lifting.checks import MEDIAN, Check, Evidence, checked, proportions
 from probmotion.lifting.keypoints import (
     PERSON,
     BodyPath,
@@ -48,7 +48,6 @@ _FITTED = 0.9  # share of the residuals that the fit leaves
 # Largest ratio of a joint's residuals to the noise in two, and in three or more views.
 _CONTRADICTIONS = (1.6, 2.4)
 _NOISE = 0.04  # largest noise of one view at the person's distance, metres
-_PROPORTIONS = 3.0  # largest mean square of standardised bone lengths
 _FEWEST, _SHARE = 10, 0.1  # frames in which a view shows the person
 
 
@@ -264,8 +263,8 @@ def lift_views(
         for each, camera in zip(keypoints, recording.cameras.views, strict=True)
     ]
     chains *= size
-    proportions = float(np.median([window.proportions for window in windows]))
-    return LiftedViews(size * mean, chains, level, keypoints, _worst(evidence, proportions))
+    bones = proportions(windows, len(views))
+    return LiftedViews(size * mean, chains, level, keypoints, _worst(evidence, bones))
 
 
 def _noise(recording: _Recording, starts: Sequence[int], noise: float) -> tuple[float, float]:
@@ -325,13 +324,12 @@ def _size(recording: _Recording, apparent: float, starts: Sequence[int], noise: 
     return size
 
 
-def _worst(evidence: Sequence[Evidence], proportions: float) -> tuple[Check, ...]:
+def _worst(evidence: Sequence[Evidence], bones: Check) -> tuple[Check, ...]:
     """Return the checks of V views, each with its largest value over the views.
 
-    ``proportions`` is the mean square of standardised bone lengths. Unusual motion is not marked,
-    as several views determine it. V views may have √V times the noise of one. Of three or more
-    views, one that contradicts the others is left with large residuals, while joints of detectors
-    and of the prior differ by less; two views would meet halfway.
+    Unusual motion is not marked, as several views determine it. V views may have √V times the noise
+    of one. Of three or more views, one that contradicts the others is left with large residuals,
+    while joints of detectors and of the prior differ by less; two views would meet halfway.
     """
     views = len(evidence)
     worst = {
@@ -348,11 +346,5 @@ def _worst(evidence: Sequence[Evidence], proportions: float) -> tuple[Check, ...
         worst["residual"],
         limit=_CONTRADICTIONS[views > 2],
         problem="keypoints of a view contradict the others (calibration, synchronisation, person?)",
-    )
-    bones = Check(
-        "proportions",
-        proportions,
-        _PROPORTIONS,
-        "the body has unusual proportions (another animal, swapped joints?)",
     )
     return noise, residual, bones, replace(worst["mirrored"], limit=0.0)

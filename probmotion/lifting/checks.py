@@ -12,7 +12,7 @@ from probmotion.lifting.camera import LevelCamera
 from probmotion.lifting.keypoints import ANKLES, HIPS, PersonKeypoints, averaged
 from probmotion.lifting.window_posterior import WindowSummary
 
-__all__ = ["MEDIAN", "Check", "Evidence", "checked", "uncertain"]
+__all__ = ["MEDIAN", "Check", "Evidence", "checked", "proportions", "uncertain"]
 
 MEDIAN = 1.66
 """Median of squared residuals of a keypoint under Student-t noise with 4 degrees of freedom."""
@@ -75,6 +75,7 @@ _LIMITS = {
     ),
 }
 _UNCERTAIN = 0.12  # metres; chosen likewise
+_PROPORTIONS = (6.0, 3.0)  # of one camera, chosen likewise, and of several
 
 
 def checked(evidence: Evidence) -> tuple[Check, ...]:
@@ -124,6 +125,19 @@ def uncertain(windows: Sequence[WindowSummary]) -> Check:
         _UNCERTAIN,
         "joints have a standard deviation of more than 12 cm relative to the hips (hidden legs, a "
         "rotated video, motion unlike that of the prior's clips, another animal, swapped joints?)",
+    )
+
+
+def proportions(windows: Sequence[WindowSummary], views: int) -> Check:
+    """Return the check of the lengths of bones.
+
+    ``proportions``: mean square of standardised bone lengths, median over windows.
+    """
+    return Check(
+        "proportions",
+        float(np.median([window.proportions for window in windows])),
+        _PROPORTIONS[views > 1],
+        "the body has unusual proportions (another animal, swapped joints?)",
     )
 
 

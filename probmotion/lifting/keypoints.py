@@ -13,16 +13,16 @@ from probmotion.motion.retargeting import counterpart
 from probmotion.motion.skeleton import Skeleton
 
 __all__ = [
-    "ANKLES", "HIPS", "LIMBS", "SIDED", "BodyPath", "PersonKeypoints", "averaged", "body_path",
-    "from_hips", "person_keypoints", "smooth_size",
+    "ANKLES", "HIPS", "LIMBS", "SHOULDERS", "SIDED", "BodyPath", "PersonKeypoints", "averaged",
+    "body_path", "from_hips", "person_keypoints", "smooth_size",
 ]  # fmt: skip
 
 PERSON = Skeleton.preset("person14")
 # Neck and pelvis of detectors are midpoints of shoulders and hips, which motion capture has not.
 _TRUNK = ("neck", "pelvis")
-HIPS, ANKLES = (
+HIPS, ANKLES, SHOULDERS = (
     [PERSON.joint_names.index(f"{side}_{part}") for side in ("left", "right")]
-    for part in ("hip", "ankle")
+    for part in ("hip", "ankle", "shoulder")
 )
 LIMBS = list(KEYPOINTS)
 """Joints of arms and legs."""

@@ -12,7 +12,14 @@ import numpy as np
 from probmotion import seeds
 from probmotion.geometry.rotations import vector_to_matrix
 from probmotion.lifting.camera import LevelCamera
-from probmotion.lifting.checks import MEDIAN, Check, Evidence, checked, uncertain
+from probmotion.lifting.checks import (
+    MEDIAN,
+    Check,
+    Evidence,
+    checked,
+    proportions,
+    uncertain,
+)
 from probmotion.lifting.keypoints import (
     LIMBS,
     BodyPath,
@@ -145,7 +152,7 @@ def lift_track(
     floor = float(np.median([summary.floor.mean for summary in summaries]))
     mirrored = other.score - estimate.score
     evidence = Evidence(keypoints, fps, found, level, mean, mirrored)
-    checks = (*checked(evidence), uncertain(summaries))
+    checks = (*checked(evidence), proportions(summaries, 1), uncertain(summaries))
     if pitch is None:
         _tilt(chains, estimate.error.pitch, seed)
     return TrackLift(mean, chains, floor, found, estimate.error.focal, level, checks)

@@ -298,3 +298,20 @@ class KeypointTrack:
     def frames(self) -> int:
         """Number of frames L."""
         return len(self.keypoints)
+
+    def flipped(self, axes: str, image_size: tuple[int, int]) -> KeypointTrack:
+        """Return the track with mirrored image coordinates; joints keep their names.
+
+        Parameters
+        ----------
+        axes : {"x", "y", "xy"}
+            Coordinates that are mirrored: ``"y"`` if y points up, ``"xy"`` if the video is upside
+            down.
+        image_size : tuple of int
+            Width and height of the video, pixels.
+        """
+        if axes not in ("x", "y", "xy"):
+            raise ValueError(f"axes must be 'x', 'y' or 'xy', got {axes!r}")
+        flip = [axis in axes for axis in "xy"]
+        keypoints = np.where(flip, np.array(image_size) - self.keypoints, self.keypoints)
+        return replace(self, keypoints=keypoints)

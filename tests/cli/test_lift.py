@@ -111,6 +111,19 @@ def test_an_interrupted_lift_leaves_whole_folders_alone(capsys, monkeypatch, det
     assert sorted(path.name for path in (out / "person-0").iterdir()) == NAMES
 
 
+def test_keypoints_with_y_up_are_flipped(fails, landmarks, tmp_path):
+    content = json.loads(landmarks.read_text(encoding="utf-8"))
+    for frame in content["frames"]:
+        for landmark in frame["pose_landmarks"]:
+            landmark[1] = 1 - landmark[1]
+    path = tmp_path / "y_up.json"
+    path.write_text(json.dumps(content), encoding="utf-8")
+    out = ["--draws", "2", "--out", str(tmp_path / "out")]
+    assert "--flip y of probmotion lift if y points up" in fails("lift", str(path), *out)
+    assert main(["lift", str(path), *out, "--flip", "y"]) == 0
+    assert json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))["trusted"]
+
+
 def test_strict_fails_for_motion_that_is_not_trusted(fails, detections, tmp_path):
     results = json.loads(detections.read_text(encoding="utf-8"))
     rng = np.random.default_rng(0)
@@ -132,6 +145,7 @@ def test_errors_are_one_line_and_leave_no_files(fails, detections, tmp_path):
         (*SIZE,): "--fps 30 is a video of 30 frames per second",
         ("--fps", "30", *SIZE, "--person", "5"): "--person must be 0 to 1, got 5",
         ("--fps", "30", *SIZE, "--fov", "0"): "fov must be 10 to 150",
+        ("--fps", "30", "--flip", "y", "--camera", "c.toml"): "--flip must not be given with",
     }
     for options, expected in cases.items():
         assert expected in fails(*base, *options), options

@@ -83,7 +83,10 @@ def _write_log_terms(
             k = candidates[view, position]
             cosine, sine = cosines[view, position], sines[view, position]
             residual(joints[view], prepared.joints[k], cosine, sine, difference)
-            bounds[position] = _bounded_sum(difference, k, prepared, terms, limit)
+            start, stop = prepared.edge_start[k], prepared.edge_start[k + 1]
+            bounds[position] = _bounded_sum(
+                difference, prepared.edges, prepared.weights, start, stop, 0.0, limit
+            )
             possible |= bounds[position] <= limit
         if not possible:
             continue
@@ -95,9 +98,12 @@ def _write_log_terms(
             k = candidates[view, position]
             cosine, sine = cosines[view, position], sines[view, position]
             residual(joints[view], prepared.joints[k], cosine, sine, difference)
-            occluded, seen = prepared.n_visible[k] < n_joints, prepared.seen[k]
-            total = projection_sum(difference, projection, occluded, seen, terms)
-            distance = total + bounds[position]
+            if prepared.n_visible[k] < n_joints:
+                total = projection_sum(difference, projection, True, prepared.seen[k], terms)
+                distance = total + bounds[position]
+            else:
+                edges, weights, stop = projection.edges, projection.weights, projection.n_edges
+                distance = _bounded_sum(difference, edges, weights, 0, stop, bounds[position], best)
             if distance <= best:
                 best = distance
                 logs[view] = -0.5 * (distance / noise) ** 2
@@ -106,13 +112,17 @@ def _write_log_terms(
 
 @numba.njit(cache=True)
 def _bounded_sum(
-    difference: np.ndarray, k: int, prepared: Prepared, terms: np.ndarray, limit: float
+    difference: np.ndarray,
+    edges: np.ndarray,
+    weights: np.ndarray,
+    start: int,
+    stop: int,
+    other: float,
+    limit: float,
 ) -> float:
-    """Return the sum over the annotation's graph, or infinity once it exceeds ``limit``."""
-    start, stop = prepared.edge_start[k], prepared.edge_start[k + 1]
+    """Return the sum over a graph plus ``other``, or infinity once it exceeds ``limit``."""
     if start == stop:
         return np.inf
-    weights, edges = prepared.weights, prepared.edges
     # Sums have the order of summation of nearest_kernels, so that results are bit-identical.
     a, b, c, d = 0.0, 0.0, 0.0, 0.0
     unrolled = stop - (stop - start) % 4
@@ -121,11 +131,11 @@ def _bounded_sum(
         b += weights[edge + 1] * _length(difference, edges[0, edge + 1], edges[1, edge + 1])
         c += weights[edge + 2] * _length(difference, edges[0, edge + 2], edges[1, edge + 2])
         d += weights[edge + 3] * _length(difference, edges[0, edge + 3], edges[1, edge + 3])
-        if (a + b) + (c + d) > limit:
+        if (a + b) + (c + d) + other > limit:
             return np.inf
     for edge in range(unrolled, stop):
         a += weights[edge] * _length(difference, edges[0, edge], edges[1, edge])
-    total = (a + b) + (c + d)
+    total = (a + b) + (c + d) + other
     return total
 
 
