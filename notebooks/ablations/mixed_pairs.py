@@ -63,13 +63,13 @@ class MixedStudy(Study):
     def by_tempering(self) -> Runs:
         """Draws from the densities that are compared.
 
-        Both coordinates have the same annotations and views. Of 5599 annotations, 855 are among the
+        All distances have the same annotations and views. Of 5599 annotations, 855 are among the
         nearest ones of 32 views, and 5596 among those of 2048.
         """
         variants: dict[str, dict[str, Any]] = {
             f"{density} {size}": {"density": density, "noise": size}
             for size in (0.005, 0.01)
-            for density in ("interaction", "cartesian")
+            for density in ("interaction", "cartesian", "shape-context")
         }
         variants["2048 views"] = {"density": "interaction", "noise": 0.01, "n_views": 2048}
         return self.mixed(variants, self.repeats)

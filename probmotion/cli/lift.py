@@ -66,11 +66,11 @@ class Lift:
     height: Annotated[float | None, arg(metavar="METRES", help_behavior_hint="")] = None
     """Height of the person, metres; 1.7 ± .1 by default."""
 
-    flip: Annotated[Literal["x", "y", "xy"] | None, arg(metavar="AXES", help_behavior_hint="")] = (
-        None
-    )
+    flip: Annotated[
+        Literal["x", "y", "xy"] | None, arg(metavar="{x,y,xy}", help_behavior_hint="")
+    ] = None
     """Mirror coordinates of the keypoints: y if y points up, xy if the video is upside down, x if
-    it is mirrored but left and right joints are not."""
+    the image was mirrored after detection."""
 
     draws: int = 100
     """Number of posterior draws."""
@@ -100,14 +100,8 @@ class Lift:
                     "--image-size or --camera must be given, got neither; --image-size 1920 1080 "
                     "is a video of this width and height"
                 )
-            if self.flip is not None:
-                tracks = [track.flipped(self.flip, size) for track in files[0].tracks]
-                files = [replace(files[0], tracks=tracks)]
-        elif self.flip is not None:
-            raise ValueError(
-                f"--flip must not be given with --camera, got {self.flip}; calibrations are of "
-                "upright keypoints"
-            )
+        if self.flip is not None:
+            files = self._flipped(self.flip, files, size)
         people = self._people(paths, files)
         check_writable(self.out)
         doubtful, refused = [], []
@@ -181,6 +175,24 @@ class Lift:
         if self.camera is None:
             return file
         return replace(file, tracks=[replace(track, name=path.stem) for track in file.tracks])
+
+    def _flipped(
+        self, axes: str, files: list[KeypointFile], size: tuple[int, int] | None
+    ) -> list[KeypointFile]:
+        """Return files with mirrored coordinates, of the image's size or those of the cameras."""
+        from probmotion.io.keypoints.calibration import read_calibration
+
+        if self.camera is None:
+            assert size is not None
+            sizes = [size]
+        else:
+            calibration = read_calibration(self.camera)
+            found = calibration.matched([file.tracks[0].name for file in files])
+            sizes = [calibration.sizes[index] for index in found]
+        return [
+            replace(file, tracks=[track.flipped(axes, each) for track in file.tracks])
+            for file, each in zip(files, sizes, strict=True)
+        ]
 
     def _people(self, paths: list[Path], files: list[KeypointFile]) -> list[list[KeypointTrack]]:
         """Return the tracks of every person, one a camera."""

@@ -9,10 +9,20 @@ from typing import NamedTuple
 import numpy as np
 
 from probmotion.lifting.camera import LevelCamera
-from probmotion.lifting.keypoints import ANKLES, HIPS, PersonKeypoints, averaged
+from probmotion.lifting.keypoints import (
+    ANKLES,
+    HIPS,
+    SHOULDERS,
+    BodyPath,
+    PersonKeypoints,
+    averaged,
+    smooth_size,
+)
 from probmotion.lifting.window_posterior import WindowSummary
 
-__all__ = ["MEDIAN", "Check", "Evidence", "checked", "proportions", "uncertain"]
+__all__ = [
+    "MEDIAN", "Check", "Evidence", "check_upright", "checked", "proportions", "uncertain",
+]  # fmt: skip
 
 MEDIAN = 1.66
 """Median of squared residuals of a keypoint under Student-t noise with 4 degrees of freedom."""
@@ -71,11 +81,35 @@ _LIMITS = {
     "unsteady": (0.28, "feet and body move sideways together (does the camera move?)"),
     "mirrored": (
         20.0,
-        "the motion is more likely with left and right exchanged (is the video mirrored?)",
+        "the motion is more likely with left and right exchanged (was the image mirrored after "
+        "detection? --flip x)",
     ),
 }
 _UNCERTAIN = 0.12  # metres; chosen likewise
 _PROPORTIONS = (6.0, 3.0)  # of one camera, chosen likewise, and of several
+# Height of ankles above shoulders in the image, metres at the person's scale. People who get up or
+# crawl, seen from a height of 4 m, reach .61 m.
+_UPSIDE_DOWN = 0.7
+
+
+def check_upright(keypoints: PersonKeypoints, path: BodyPath) -> None:
+    """Raise ``ValueError`` for people who are upside down in the image."""
+    points, weight, _ = keypoints
+    shown = weight > 0
+    shoulders, ankles = (
+        (shown[:, joints] * points[:, joints, 1]).sum(axis=1)
+        / np.maximum(shown[:, joints].sum(axis=1), 1)
+        for joints in (SHOULDERS, ANKLES)
+    )
+    seen = shown[:, SHOULDERS].any(axis=1) & shown[:, ANKLES].any(axis=1)
+    below = ((shoulders - ankles) / smooth_size(path.size))[seen]
+    enough = min(max(_FEWEST, _SHARE * len(points)), len(points))
+    if len(below) >= enough and np.median(below) > _UPSIDE_DOWN:
+        raise ValueError(
+            f"keypoints must show a person upright, got shoulders {np.median(below):.1f} m below "
+            "the ankles; flip them: --flip y of probmotion lift, or KeypointTrack.flipped, if y "
+            "points up, --flip xy if the video is upside down"
+        )
 
 
 def checked(evidence: Evidence) -> tuple[Check, ...]:
@@ -124,7 +158,7 @@ def uncertain(windows: Sequence[WindowSummary]) -> Check:
         float(np.nanmedian(spreads)),
         _UNCERTAIN,
         "joints have a standard deviation of more than 12 cm relative to the hips (hidden legs, a "
-        "rotated video, motion unlike that of the prior's clips, another animal, swapped joints?)",
+        "rotated video, motion unlike that of the prior's clips, another animal?)",
     )
 
 

@@ -19,15 +19,7 @@ from probmotion.lifting.calibrated import (
     lift_views,
 )
 from probmotion.lifting.camera import LevelCamera
-from probmotion.lifting.keypoints import (
-    ANKLES,
-    PERSON,
-    SHOULDERS,
-    PersonKeypoints,
-    body_path,
-    person_keypoints,
-    smooth_size,
-)
+from probmotion.lifting.keypoints import PERSON, PersonKeypoints, person_keypoints
 from probmotion.lifting.result import Lift
 from probmotion.lifting.track_lift import TrackLift, lift_track
 from probmotion.models.mixture.conditioning import rotation
@@ -43,9 +35,6 @@ _HEIGHT, _HEIGHT_SPREAD = 1.7, 0.06  # of adults: mean, metres, and relative sta
 _MEASURED = 0.01  # relative standard deviation of a given height
 _LEVEL = 0.05  # standard deviation of the floor about 0 of a calibration, metres
 _NOISE = 0.004  # first estimate of the keypoints' noise, of the image's longer side
-# Ankles above shoulders in the image, metres at the person's size; more than those of people who
-# get up or crawl towards a camera at a height of four metres.
-_UPSIDE_DOWN = 0.7
 
 
 def lift(
@@ -202,7 +191,6 @@ def _before_camera(
     keypoints = person_keypoints(track)
     _check_visible(keypoints.weight, track)
     _check_inside(keypoints, image_size)
-    _check_upright(keypoints)
     side = max(image_size) if fov is None else image_size[0]
     focal = 0.5 * side / np.tan(np.radians(fov or _FOV) / 2)
     camera = LevelCamera(focal, (image_size[0] / 2, image_size[1] / 2))
@@ -324,20 +312,4 @@ def _check_inside(keypoints: PersonKeypoints, image_size: tuple[int, int]) -> No
             f"keypoints must be pixels of an image of {image_size[0]} × {image_size[1]}, got "
             f"{low[0]:.3g} to {high[0]:.3g} in x and {low[1]:.3g} to {high[1]:.3g} in y; give "
             "the video's size (--image-size) and keypoints in pixels"
-        )
-
-
-def _check_upright(keypoints: PersonKeypoints) -> None:
-    """Refuse people who are upside down."""
-    points, weight, _ = keypoints
-    seen = (weight[:, SHOULDERS + ANKLES] > 0).all(axis=1)
-    if seen.sum() < 2:
-        return  # too few to estimate the size
-    below = points[:, SHOULDERS, 1].mean(axis=1) - points[:, ANKLES, 1].mean(axis=1)
-    metres = (below / smooth_size(body_path(keypoints).size))[seen]
-    if np.median(metres) > _UPSIDE_DOWN:
-        raise ValueError(
-            f"keypoints must show a person upright, got shoulders {np.median(metres):.1f} m below "
-            "the ankles; flip them (--flip y of probmotion lift if y points up, --flip xy if the "
-            "video is upside down)"
         )

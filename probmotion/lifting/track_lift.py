@@ -16,6 +16,7 @@ from probmotion.lifting.checks import (
     MEDIAN,
     Check,
     Evidence,
+    check_upright,
     checked,
     proportions,
     uncertain,
@@ -133,6 +134,7 @@ def lift_track(
     """
     with one_thread():
         windows = _windows(keypoints, fps)
+        check_upright(windows.keypoints, windows.path)
     with one_thread(), progress_bar(len(windows.starts), "lift", progress) as bar:
         with ThreadPoolExecutor(2) as pool:
             estimate, other = pool.map(

@@ -119,7 +119,7 @@ def test_keypoints_with_y_up_are_flipped(fails, landmarks, tmp_path):
     path = tmp_path / "y_up.json"
     path.write_text(json.dumps(content), encoding="utf-8")
     out = ["--draws", "2", "--out", str(tmp_path / "out")]
-    assert "--flip y of probmotion lift if y points up" in fails("lift", str(path), *out)
+    assert "flip them: --flip y of probmotion lift" in fails("lift", str(path), *out)
     assert main(["lift", str(path), *out, "--flip", "y"]) == 0
     assert json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))["trusted"]
 
@@ -145,7 +145,6 @@ def test_errors_are_one_line_and_leave_no_files(fails, detections, tmp_path):
         (*SIZE,): "--fps 30 is a video of 30 frames per second",
         ("--fps", "30", *SIZE, "--person", "5"): "--person must be 0 to 1, got 5",
         ("--fps", "30", *SIZE, "--fov", "0"): "fov must be 10 to 150",
-        ("--fps", "30", "--flip", "y", "--camera", "c.toml"): "--flip must not be given with",
     }
     for options, expected in cases.items():
         assert expected in fails(*base, *options), options
@@ -199,6 +198,24 @@ def test_one_of_the_calibrated_cameras_is_found_by_its_name(capsys, trial, tmp_p
     assert "the 1 camera (cam_10)" in capsys.readouterr().out
     distance = np.linalg.norm(load(tmp_path / "lift.npz").positions - truth, axis=-1)[:, 2:]
     assert distance.mean() < 0.4
+
+
+def test_keypoints_of_a_calibrated_camera_with_y_up_are_flipped(fails, trial, tmp_path):
+    folder, truth = trial
+    flipped = tmp_path / "cam10_json"
+    flipped.mkdir()
+    for path in (folder / "pose-associated" / "cam10_json").iterdir():
+        points = np.reshape(json.loads(path.read_text())["people"][0]["pose_keypoints_2d"], (-1, 3))
+        points[:, 1] = 1000 - points[:, 1]
+        people = [{"pose_keypoints_2d": points.ravel().tolist()}]
+        (flipped / path.name).write_text(json.dumps({"people": people}), encoding="utf-8")
+    words = ["lift", str(flipped), "--camera", str(folder / "Calib.toml"), "--fps", "30"]
+    words += ["--draws", "2", "--out", str(tmp_path / "out")]
+    assert "keypoints must show a person upright" in fails(*words)
+    assert not (tmp_path / "out").exists()
+    assert main([*words, "--flip", "y"]) == 0
+    distance = np.linalg.norm(load(tmp_path / "out" / "lift.npz").positions - truth, axis=-1)
+    assert distance[:, 2:].mean() < 0.4
 
 
 def test_wrong_cameras_are_named(fails, trial, detections, tmp_path):

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from probmotion.lifting.camera import LevelCamera
-from probmotion.lifting.checks import Evidence, checked
-from probmotion.lifting.keypoints import ANKLES, PersonKeypoints
+from probmotion.lifting.checks import Evidence, check_upright, checked
+from probmotion.lifting.keypoints import ANKLES, SHOULDERS, BodyPath, PersonKeypoints
 
 FPS, DEPTH, FOCAL = 30.0, 8.0, 900.0
 FAST = 3.0  # of feet, metres per second
@@ -42,3 +42,20 @@ def test_unsteadiness_is_the_median_deviation_of_velocities():
 def test_noise_alone_is_not_unsteady():
     assert unsteadiness(np.zeros(900), noise=4.0) < 0.05
     assert unsteadiness(np.zeros(900), noise=2.0, weight=0.25) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("ankles", "frames", "refused"),
+    [(1.2, 40, True), (0.6, 40, False), (-1.2, 40, False), (1.2, 4, False)],
+)
+def test_people_are_upside_down_if_ankles_are_far_above_shoulders(ankles, frames, refused):
+    points, weight = np.zeros((40, 14, 2)), np.zeros((40, 14))
+    points[:, SHOULDERS, 1], points[:, ANKLES, 1] = 500.0, 500.0 - 100 * ankles
+    weight[:, SHOULDERS], weight[:frames, ANKLES[0]] = 1.0, 1.0  # one ankle is never seen
+    path = BodyPath(np.zeros((40, 2)), np.full(40, 100.0))
+    keypoints = PersonKeypoints(points, weight, 0.0)
+    if not refused:
+        check_upright(keypoints, path)
+        return
+    with pytest.raises(ValueError, match=r"shoulders 1\.2 m below the ankles; flip them: --flip y"):
+        check_upright(keypoints, path)

@@ -88,6 +88,17 @@ def test_invalid_tracks_are_refused(points, confidence, message):
         KeypointTrack(points, confidence, CHAIN, 30)
 
 
+def test_tracks_are_flipped_within_the_image():
+    track = KeypointTrack(with_nan(POINTS, 2, 1), np.where(SEEN > 2, SEEN, 0.0), CHAIN, 30)
+    x, y = np.moveaxis(track.keypoints, -1, 0)
+    expected = {"x": (640 - x, y), "y": (x, 480 - y), "xy": (640 - x, 480 - y)}
+    for axes, parts in expected.items():
+        flipped = track.flipped(axes, (640, 480))
+        np.testing.assert_array_equal(flipped.keypoints, np.stack(parts, axis=-1))
+    with pytest.raises(ValueError, match="axes must be 'x', 'y' or 'xy', got 'z'"):
+        track.flipped("z", (640, 480))
+
+
 def test_load_all_sorts_and_resamples(tmp_path):
     for name, fps in (("b", 60.0), ("a", 30.0)):
         motion = chain_motion(frames=int(fps) + 1, fps=fps)

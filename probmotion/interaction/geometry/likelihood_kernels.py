@@ -120,7 +120,10 @@ def _bounded_sum(
     other: float,
     limit: float,
 ) -> float:
-    """Return the sum over a graph plus ``other``, or infinity once it exceeds ``limit``."""
+    """Return the sum over a graph plus ``other``.
+
+    It is infinite for an empty graph, or once it exceeds ``limit``.
+    """
     if start == stop:
         return np.inf
     # Sums have the order of summation of nearest_kernels, so that results are bit-identical.
@@ -135,8 +138,7 @@ def _bounded_sum(
             return np.inf
     for edge in range(unrolled, stop):
         a += weights[edge] * _length(difference, edges[0, edge], edges[1, edge])
-    total = (a + b) + (c + d) + other
-    return total
+    return (a + b) + (c + d) + other
 
 
 @numba.njit(cache=True)
