@@ -22,6 +22,7 @@ from probmotion.validation import check_finite, check_shape
 __all__ = ["Calibration", "read_calibration", "view_folders"]
 
 _LAST_ROW = np.array([0.0, 0.0, 1.0])  # of intrinsics
+_FOVS = (1.0, 160.0)  # smallest and largest of an image's longer side, degrees
 _STAGES = ("pose-associated", "pose-sync", "pose")  # folders of Pose2Sim, the last stage first
 
 
@@ -187,6 +188,13 @@ def _camera(
     if not (width >= 1 and height >= 1):
         raise MotionFileError(f"{where}: size must be pixels, got {width:g} × {height:g}")
     size = (round(width), round(height))
+    for focal in (matrix[0, 0], matrix[1, 1]):
+        fov = np.degrees(2 * np.arctan(max(size) / (2 * focal)))
+        if not _FOVS[0] <= fov <= _FOVS[1]:
+            raise MotionFileError(
+                f"{where}: matrix must have focal lengths in pixels, got {focal:g}, a field of "
+                f"view of {fov:.3g}° for {size[0]} × {size[1]}"
+            )
     return matrix, distortion, np.asarray(vector_to_matrix(vector)), translation, size
 
 

@@ -111,6 +111,8 @@ def test_names_of_some_cameras_only_are_refused(path, names, got):
         ("-0.3, 0.1, ", "", "distortions must be 4 or 5"),
         ("1088.0", "0.0", "size must be pixels"),
         ("[1680.0, 0.0", "[-1680.0, 0.0", "focal lengths and principal point"),
+        ("[1680.0, 0.0", "[1e9, 0.0", "focal lengths in pixels, got 1e\\+09, a field of view of 0"),
+        ("[0.0, 1682.0", "[0.0, 1.6", "focal lengths in pixels, got 1.6"),
     ],
 )
 def test_defects_are_reported(path, old, new, words):
