@@ -1,6 +1,6 @@
 """Speed and memory of ``lift`` on made video, as ``name: value`` lines.
 
-Seconds are of one minute. Ten minutes are the keypoints of this minute, ten times.
+Seconds and the size of the page are of one minute. Ten minutes are the keypoints of this minute, ten times.
 """
 
 from __future__ import annotations
@@ -34,7 +34,9 @@ def main() -> None:
     start = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         save(result.mean, Path(folder) / "lift.glb")
-    print(f"export_glb_seconds: {time.perf_counter() - start:.3g}")
+        print(f"export_glb_seconds: {time.perf_counter() - start:.3g}")
+        page = result.report(Path(folder) / "lift.html")
+        print(f"lift_page_megabytes: {page.stat().st_size / 1e6:.2g}")
     print(f"lift_peak_gib: {peak_gib():.2f}", flush=True)
     minute = video.track
     long = replace(

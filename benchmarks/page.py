@@ -58,6 +58,7 @@ BENCHMARKS: dict[str, dict[str, str]] = {
     "lift.py": {
         "lift_seconds_per_second_of_video": "at most 0.5; 1: real time",
         "export_glb_seconds": "at most 2",
+        "lift_page_megabytes": "at most 5",
         "lift_peak_gib": "at most 2",
         "lift_peak_gib_ten_minutes": "at most 2",
     },
@@ -70,6 +71,10 @@ BENCHMARKS: dict[str, dict[str, str]] = {
         "peak_gib": "at most 3",
     },
     "pose_pairs.py": {
+        "single_view_proposals_per_second": "at least 15 000",
+        "full_density_ms": "at most 1.2",
+        "full_density_batch_ms": "at most 0.6",
+        "full_proposals_per_second": "at least 3 000",
         "draws_per_second": "10: the published system, on four cores",
         "ess_per_second": "",
         "memory_gib": "",
