@@ -1,6 +1,7 @@
 """Speed and memory of ``lift`` on made video, as ``name: value`` lines.
 
-Seconds and the size of the page are of one minute. Ten minutes are the keypoints of this minute, ten times.
+Seconds and the size of the page are of one minute. Ten minutes are the keypoints of this minute,
+ten times.
 """
 
 from __future__ import annotations

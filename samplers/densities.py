@@ -9,7 +9,7 @@ import numpy as np
 from probmotion import seeds
 from probmotion.posteriors.draws import MotionDraws, check_same_run
 from probmotion.posteriors.posterior import MotionPosterior
-from probmotion.posteriors.protocols import HasSeeds, NotConjugate
+from probmotion.posteriors.protocols import HasSeeds, Marginalises, NotConjugate
 from probmotion.posteriors.sampling import Sampler, UnsupportedPosterior, batches, require
 from probmotion.seeds import NormalStreams
 from probmotion.validation import check_count, check_finite, check_shape
@@ -172,9 +172,11 @@ def motions(posterior: MotionPosterior, theta: np.ndarray, seed: int, first: int
     chains, draws, _ = theta.shape
     shape = (posterior.frames, posterior.skeleton.n_joints, 3)
     out = np.empty((chains, draws, *shape))
+    streams = None  # takes as long as the motions
     for chain in range(chains):
         for numbers in batches(range(draws), 256):
-            streams = NormalStreams.of_draws(seed, [(chain, first + draw) for draw in numbers])
+            if isinstance(posterior.prior, Marginalises):
+                streams = NormalStreams.of_draws(seed, [(chain, first + draw) for draw in numbers])
             batch = slice(numbers[0], numbers[-1] + 1)
             out[chain, batch] = posterior.complete(theta[chain, batch], streams)
     return out
