@@ -172,7 +172,7 @@ def motions(posterior: MotionPosterior, theta: np.ndarray, seed: int, first: int
     chains, draws, _ = theta.shape
     shape = (posterior.frames, posterior.skeleton.n_joints, 3)
     out = np.empty((chains, draws, *shape))
-    streams = None  # takes as long as the motions
+    streams = None  # creating generators can take as long as the motions
     for chain in range(chains):
         for numbers in batches(range(draws), 256):
             if isinstance(posterior.prior, Marginalises):

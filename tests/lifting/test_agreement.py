@@ -4,6 +4,7 @@ Draws' spreads in lifts are larger than the modes' by a factor chosen on clips, 
 """
 
 from functools import partial
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -114,7 +115,8 @@ def pareto_k(log_density, mode, number):
     z = mode.mean + solve_triangular(mode.lower, unit.T, lower=True, trans=1).T
     with jax.enable_x64(True):
         exact = np.asarray(jax.vmap(log_density)(jnp.asarray(z)))
-    return float(array_stats.psislw(exact + 0.5 * (unit**2).sum(axis=1))[1])
+    # The library expects log likelihoods left out, the negative of log weights.
+    return float(array_stats.psislw(-(exact + 0.5 * (unit**2).sum(axis=1)))[1])
 
 
 def about_hips(positions):
@@ -169,6 +171,14 @@ def compared(number):
     half = solve_triangular(mode.lower, columns, lower=True)
     spread = np.sqrt((half**2).sum(axis=0)).reshape(sd.shape)
     return *differences, np.median(spread / sd), np.median(r_hat), pareto_k(exact, mode, number)
+
+
+@pytest.mark.parametrize("spread", [1.5, 3.0])
+def test_pareto_k_of_a_wider_normal_is_exact(spread):
+    # The weight of u is exp((1 − 1/s²) u²/2), whose tail has the index 1 − 1/s².
+    mode = SimpleNamespace(mean=np.zeros(1), lower=np.eye(1))
+    k = pareto_k(lambda z: -0.5 * (z @ z) / spread**2, mode, 0)
+    assert k == pytest.approx(1 - spread**-2, abs=0.15)
 
 
 @pytest.fixture(scope="module")
