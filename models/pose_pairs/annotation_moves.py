@@ -6,7 +6,12 @@ import numpy as np
 
 from probmotion.extras import numba
 from probmotion.models.pose_pairs.joint_limits_frames import from_frame, least_rotation
-from probmotion.models.pose_pairs.pair_densities import Vector, ViewAnnotations, image_axes
+from probmotion.models.pose_pairs.pair_densities import (
+    Vector,
+    ViewAnnotations,
+    between,
+    image_axes,
+)
 from probmotion.models.pose_pairs.pair_moves import Body
 
 __all__ = ["approach", "draw_sides", "log_side_probability", "scaled_depths", "transfer"]
@@ -47,21 +52,21 @@ def approach(
         parent = body.parents[joint]
         if body.framing[joint] or parent < 0:
             continue
-        bone = pose[joint] - pose[parent]
+        bone = between(pose, parent, joint)
         if root < 0 or body.below[root, joint]:
             x = image[0, joint] - image[0, parent]
             y = image[1, joint] - image[1, parent]
             z = _component(bone, towards)
             u, v = joints[0, joint] - joints[0, parent], joints[1, joint] - joints[1, parent]
-            length = np.sqrt((bone**2).sum())
+            length = _length(bone)
             goal = _lifted(cosine * u - sine * v, sine * u + cosine * v, z, length)
             (x, y, new_z), log_area = _scaled_angle((x, y, z), goal, ratio)
             if log_area == -np.inf or (new_z > 0) != (z > 0):
                 return -np.inf
             log_volume += log_area
-            for axis in range(3):
-                bone[axis] = x * right[axis] + y * up[axis] + new_z * towards[axis]
-        proposed[joint] = proposed[parent] + bone
+            bone = from_frame((right, up, towards), (x, y, new_z))
+        for axis in range(3):
+            proposed[joint, axis] = proposed[parent, axis] + bone[axis]
     return log_volume
 
 
@@ -103,18 +108,17 @@ def transfer(
         parent, side = body.parents[joint], sides[joint]
         if body.framing[joint] or parent < 0:
             continue
-        bone = pose[joint] - pose[parent]
-        length = np.sqrt((bone**2).sum())
+        bone = between(pose, parent, joint)
+        length = _length(bone)
         u, v = old[0, joint] - old[0, parent], old[1, joint] - old[1, parent]
         start_bone = _lifted(cosine * u - sine * v, sine * u + cosine * v, side, length)
         u, v = new[0, joint] - new[0, parent], new[1, joint] - new[1, parent]
         x, y = new_cosine * u - new_sine * v, new_sine * u + new_cosine * v
         turn = least_rotation(start_bone, _lifted(x, y, side, length))
         vector = (_component(bone, right), _component(bone, up), _component(bone, towards))
-        x, y, z = from_frame(turn, vector)
+        bone = from_frame((right, up, towards), from_frame(turn, vector))
         for axis in range(3):
-            bone[axis] = x * right[axis] + y * up[axis] + z * towards[axis]
-        proposed[joint] = proposed[parent] + bone
+            proposed[joint, axis] = proposed[parent, axis] + bone[axis]
     return log_volume
 
 
@@ -141,8 +145,8 @@ def scaled_depths(pose: np.ndarray, view: int, body: Body, views: ViewAnnotation
     for joint in range(len(pose)):
         parent = body.parents[joint]
         if parent >= 0:
-            bone = pose[joint] - pose[parent]
-            depths[joint] = _component(bone, towards) / np.sqrt((bone**2).sum()) / _SIDE_SCALE
+            bone = between(pose, parent, joint)
+            depths[joint] = _component(bone, towards) / _length(bone) / _SIDE_SCALE
     return depths
 
 
@@ -151,8 +155,9 @@ def _image(pose: np.ndarray, right: Vector, up: Vector) -> np.ndarray:
     """Return the joints in the image plane, (2, J)."""
     image = np.empty((2, len(pose)))
     for joint in range(len(pose)):
-        image[0, joint] = _component(pose[joint], right)
-        image[1, joint] = _component(pose[joint], up)
+        position = (pose[joint, 0], pose[joint, 1], pose[joint, 2])
+        image[0, joint] = _component(position, right)
+        image[1, joint] = _component(position, up)
     return image
 
 
@@ -185,8 +190,13 @@ def _distance(joints: np.ndarray, first: int, second: int) -> float:
 
 
 @numba.njit(cache=True, nogil=True)
-def _component(vector: np.ndarray, axis: Vector) -> float:
+def _component(vector: Vector, axis: Vector) -> float:
     return vector[0] * axis[0] + vector[1] * axis[1] + vector[2] * axis[2]
+
+
+@numba.njit(cache=True, nogil=True)
+def _length(vector: Vector) -> float:
+    return np.sqrt(_component(vector, vector))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -202,7 +212,7 @@ def _lifted(x: float, y: float, side: float, length: float) -> Vector:
 @numba.njit(cache=True, nogil=True)
 def _scaled_angle(vector: Vector, goal: Vector, ratio: float) -> tuple[Vector, float]:
     """Return a vector with its angle to a direction scaled, and the log ratio of solid angles."""
-    length = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
+    length = _length(vector)
     x, y, z = vector[0] / length, vector[1] / length, vector[2] / length
     cosine = x * goal[0] + y * goal[1] + z * goal[2]
     x, y, z = x - cosine * goal[0], y - cosine * goal[1], z - cosine * goal[2]

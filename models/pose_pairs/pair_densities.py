@@ -20,9 +20,9 @@ from probmotion.models.pose_pairs.pair_moves import Body, log_root_positions
 from probmotion.models.pose_pairs.penetration_kernels import total_depths
 
 __all__ = [
-    "Physics", "Vector", "ViewAnnotations", "image_axes", "log_annotations", "log_lengths",
-    "log_measure", "log_penetration", "log_prior", "log_prior_terms", "log_surrogate", "log_view",
-    "log_views", "project_to_view", "write_limit_terms",
+    "Physics", "Vector", "ViewAnnotations", "between", "image_axes", "log_annotations",
+    "log_lengths", "log_measure", "log_penetration", "log_prior", "log_prior_terms",
+    "log_surrogate", "log_view", "log_views", "project_to_view", "write_limit_terms",
 ]  # fmt: skip
 
 Vector = tuple[float, float, float]
@@ -226,16 +226,17 @@ def _local_frame(pose: np.ndarray, body: Body) -> tuple[Vector, Vector, Vector]:
     """Return i, j, k of :func:`~probmotion.interaction.annotations.local_frames.local_frames`."""
     x, y, z = 0.0, 0.0, 0.0
     for person in range(len(body.roots)):
-        along = _unit(_between(pose, body.roots[person], body.chests[person]))
+        along = _unit(between(pose, body.roots[person], body.chests[person]))
         x, y, z = x + along[0], y + along[1], z + along[2]
-    i = _unit(_between(pose, body.roots[0], body.roots[1]))
+    i = _unit(between(pose, body.roots[0], body.roots[1]))
     j = _unit((x, y, z))
     return i, j, _cross(i, j)
 
 
 # Tuples avoid the allocation of small arrays.
 @numba.njit(cache=True, nogil=True)
-def _between(pose: np.ndarray, start: int, end: int) -> Vector:
+def between(pose: np.ndarray, start: int, end: int) -> Vector:
+    """Return the vector from one joint to another."""
     (a, b, c), (x, y, z) = pose[start], pose[end]
     return (x - a, y - b, z - c)
 

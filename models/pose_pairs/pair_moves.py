@@ -103,7 +103,8 @@ def propose(
             n_joints = 0
             for k in range(len(pose)):
                 if body.below[joint, k]:
-                    centre += pose[k]
+                    for i in range(3):
+                        centre[i] += pose[k, i]
                     n_joints += 1
             centre /= n_joints
         _rotation(vector, turn)
@@ -121,7 +122,8 @@ def propose(
                     vector[i] += turn[i, m] * (pose[joint, m] - pose[parent, m])
         for k in range(len(pose)):
             if body.below[joint, k]:
-                proposed[k] += vector
+                for i in range(3):
+                    proposed[k, i] += vector[i]
     else:
         angle = vector[0]
         if rng.random() < _UNIFORM_ANGLES:
@@ -139,7 +141,8 @@ def propose(
             vector[:] = proposed[joint] - pose[joint]
             for k in range(len(pose)):
                 if body.below[joint, k] or body.below[other, k]:
-                    proposed[k] = pose[k] + vector
+                    for i in range(3):
+                        proposed[k, i] = pose[k, i] + vector[i]
 
 
 @numba.njit(cache=True, nogil=True)
