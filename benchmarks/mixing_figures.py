@@ -1,18 +1,18 @@
 """Errors of samplers of many modes within budgets, for ``accuracy.py mixing``.
 
-``problems_without_a_right_sampler``: problems with exact draws or a reference on which the sampler
-that ``probmotion which`` recommends after 6 s has warnings, and no sampler here is right.
+``…_swd…``: the smallest mean ``swd_ratio``; of that sampler, ``…_mode_proportions_tv`` and
+``…_rhat``: the largest over seeds, where there are modes. ``problems_without_a_right_sampler``:
+problems with exact draws or a reference on which the sampler that ``probmotion which`` recommends
+after 6 s has warnings, and no sampler here is right. Runs on these are stored for that command.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-import numpy as np
-
 from probmotion import compare
 from probmotion.comparison import Budget, advise
-from probmotion.comparison.measurements import measured
+from probmotion.comparison.measurements import LongerRun, measured, save_longer
 from probmotion.posteriors.sampling import Sampler
 from probmotion.samplers import ParallelTempering, SequentialMonteCarlo, TemperedPairs
 
@@ -35,27 +35,37 @@ ROWS: tuple[tuple[str, str, float, int, Mapping[str, Sampler]], ...] = (
 
 
 def mixing_figures() -> Iterator[tuple[str, float]]:
-    """Yield the smallest ``swd_ratio`` of the samplers, a mean over seeds, for every row.
+    """Yield names and values, and store the runs.
 
-    It is infinite if no sampler finishes all seeds within the budget. The last figure is the number
-    of problems without a right sampler.
+    The smallest ``swd_ratio`` is infinite if no sampler finishes all seeds within the budget.
     """
     options = {"draws": DRAWS, "seeds": SEEDS, "workers": 2, "progress": False}
-    right = set()
+    runs = []
     for name, problem, seconds, chains, samplers in ROWS:
         comparison = compare(
             problem, samplers, budget=Budget(seconds=seconds), chains=chains, **options
         )  # type: ignore[arg-type]
-        if any(verdict.is_right for verdict in comparison.verdicts()[problem].values()):
-            right.add(problem)
         table = comparison.table()
         groups = table[table["metric"] == "swd_ratio"].groupby("sampler")["value"]
         ratios = groups.mean()[groups.count() == SEEDS]
-        yield name, float(ratios.min()) if len(ratios) else np.inf
+        if ratios.empty:
+            yield name, float("inf")
+            continue
+        best, verdicts = ratios.idxmin(), comparison.verdicts()[problem]
+        yield name, float(ratios[best])
+        metrics = table[table["sampler"] == best].groupby("metric")["value"].max()
+        if "mode_proportions_tv" in metrics:
+            for metric in ("mode_proportions_tv", "rhat"):
+                yield name.replace("swd", metric), float(metrics[metric])
+        runs += [
+            LongerRun(problem, sampler, seconds, ratio, verdicts[sampler].is_right)
+            for sampler, ratio in ratios.items()
+        ]
     advices = [advise(problem) for problem in measured().problems]
     without = {
         advice.problem
         for advice in advices
         if advice.metric.startswith("swd_ratio") and advice.recommended.warnings
     }
-    yield "problems_without_a_right_sampler", len(without - right)
+    save_longer([run for run in runs if run.problem in without])
+    yield "problems_without_a_right_sampler", len(without - {r.problem for r in runs if r.right})

@@ -3,9 +3,9 @@
 ``nuts_ratio``, ``ensemble_ratio``: processor seconds of our sampler over those of the library on
 the same density, start and random numbers; the script exits with an error if the draws differ.
 Both compile NUTS anew. Medians over interleaved repeats in one process.
-``…_density_fraction_…``: seconds in densities and their gradients over those of the sampler, on a
-problem with a cheap and one with a dear density. ``import_seconds``: ``import probmotion`` in a new
-process, minimum of several. Float64, one thread.
+``…_density_fraction_…``: seconds in densities and their gradients over those of the sampler, on
+problems with cheap densities and, the last, with a network. ``import_seconds``: ``import
+probmotion`` in a new process, minimum of several. Float64, one thread.
 """
 
 from __future__ import annotations
@@ -111,24 +111,29 @@ def density_fraction(
     sampler: ParallelTempering | SequentialMonteCarlo, posterior: MotionPosterior
 ) -> float:
     """Return the median fraction of a sampler's run time that is spent in densities."""
-    spent, points = 0.0, TemperedDensity.points
+    spent, fractions = 0.0, []
+    functions = {name: getattr(TemperedDensity, name) for name in ("points", "values")}
 
-    def timed(self: TemperedDensity, theta: np.ndarray, *options: Any, **others: Any) -> Points:
-        nonlocal spent
-        start = time.perf_counter()
-        result = points(self, theta, *options, **others)
-        spent += time.perf_counter() - start
-        return result
+    def timed(name: str) -> Callable[..., Points]:
+        def function(self: TemperedDensity, *options: Any, **others: Any) -> Points:
+            nonlocal spent
+            before, start = spent, time.perf_counter()
+            result = functions[name](self, *options, **others)
+            spent = before + time.perf_counter() - start
+            return result
 
-    fractions = []
-    TemperedDensity.points = timed  # type: ignore[method-assign]
+        return function
+
+    for name in functions:
+        setattr(TemperedDensity, name, timed(name))
     try:
         for seed in range(3):
             spent = 0.0
             result = sampler.sample(posterior, draws=50, seed=seed, progress=False)
             fractions.append(spent / result.seconds)
     finally:
-        TemperedDensity.points = points  # type: ignore[method-assign]
+        for name, function in functions.items():
+            setattr(TemperedDensity, name, function)
     return float(np.median(fractions))
 
 
@@ -156,7 +161,7 @@ def main() -> None:
         repeats=11,
     )
     print(f"ensemble_ratio: {ensemble_median:.3f}")
-    for name in ("gait-monocular", "gait-noisy3d"):
+    for name in ("gait-monocular", "gait-noisy3d", "walk-vae-monocular"):
         posterior = load_problem(name).posterior
         for sampler in (ParallelTempering(warmup=50, thin=1), SequentialMonteCarlo(particles=64)):
             fraction = density_fraction(sampler, posterior)

@@ -2,6 +2,7 @@
 
 probmotion compare all --quick --draws 40 --workers 2 --seeds 5 --out grid --report
 python notebooks/which_sampler.py --grid grid    # store its measurements, then write the tables
+python benchmarks/accuracy.py mixing             # store runs with larger budgets
 python notebooks/which_sampler.py                # write the tables from stored measurements
 """
 
@@ -16,7 +17,7 @@ from pathlib import Path
 from probmotion import Comparison
 from probmotion.comparison import advise
 from probmotion.comparison.advice import Advice, Standing
-from probmotion.comparison.measurements import measured, save_measurements
+from probmotion.comparison.measurements import LongerRun, measured, save_measurements
 
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", ROOT / "docs" / "which-sampler.md")
@@ -52,6 +53,7 @@ def main() -> None:
     tables = {
         "advice": "\n".join(advice_table(advices)),
         "problems": "\n".join(problem_table(advices.values())),
+        "longer": "\n".join(longer_table(measured().longer)),
         "without": "\n".join(without_table(advices.values())),
     }
     for page in PAGES:
@@ -86,6 +88,16 @@ def problem_table(advices: Iterable[Advice]) -> Iterator[str]:
             in_brief(each.worse),
         ]
         yield f"| {' | '.join(cells)} |"
+
+
+def longer_table(runs: Iterable[LongerRun]) -> Iterator[str]:
+    """Yield the table of runs with larger budgets."""
+    yield "| Problem | Sampler | Budget of a run | `swd_ratio` | Right |"
+    yield "|---|---|---|---|---|"
+    for run in runs:
+        right = "yes" if run.right else "no"
+        cells = f"`{run.problem}` | `{run.sampler}` | {run.seconds:g} s | {run.swd_ratio:.2f}"
+        yield f"| {cells} | {right} |"
 
 
 def without_table(advices: Iterable[Advice]) -> Iterator[str]:

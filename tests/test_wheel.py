@@ -53,7 +53,7 @@ def test_wheel_contains_every_module_and_nothing_else(wheel):
         "py.typed", "data/person_clips.csv", "data/registry.csv", "plots/animation.css",
         "plots/animation.js", "plots/map.js", "plots/picture.js", "reconstruction/surface.js",
         "report/copy.js", "report/page.css", "report/tables.js", "comparison/measured.csv",
-        "comparison/measured.json",
+        "comparison/measured.json", "comparison/longer.csv",
     }  # fmt: skip
     data |= {
         f"problems/references/{name}/{file}"

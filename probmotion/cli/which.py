@@ -13,8 +13,8 @@ __all__ = ["Which"]
 class Which:
     """Recommend a sampler for a problem and list its error and those of the alternatives.
 
-    The shipped measurements come from one comparison with a small budget. Use probmotion compare
-    for other problems and budgets.
+    The shipped measurements come from one comparison with a small budget and, where no sampler is
+    right within it, from longer runs. Use probmotion compare for other problems and budgets.
     """
 
     problems: Positional[tuple[str, ...]] = ()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from scipy.stats import binom
 
-from probmotion.comparison.measurements import Measured, measured
+from probmotion.comparison.measurements import LongerRun, Measured, measured
 from probmotion.comparison.results.headline_metrics import (
     HEADLINE_METRICS,
     best_of,
@@ -89,6 +89,8 @@ class Advice:
         Samplers that are significantly worse than the best.
     without_draws : dict of str
         One-word reason for missing draws, by sampler.
+    longer : LongerRun, optional
+        If the recommended sampler has warnings: the cheapest longer run that is right.
     """
 
     problem: str
@@ -100,6 +102,7 @@ class Advice:
     tied_with_warnings: tuple[Standing, ...]
     worse: tuple[Standing, ...]
     without_draws: dict[str, str]
+    longer: LongerRun | None
 
     def __str__(self) -> str:
         verdict = "no reliable sampler; best" if self.recommended.warnings else "recommended"
@@ -108,6 +111,7 @@ class Advice:
             f"measured with: {self.how}",
             f"ranked by: {self.metric}",
             f"{verdict}: {self.recommended}",
+            *([f"right with more time: {_described(self.longer)}"] if self.longer else []),
             f"on par: {_listed(self.tied)}",
             f"on par, with warnings: {_listed(self.tied_with_warnings)}",
             f"worse: {_listed(self.worse)}",
@@ -154,6 +158,7 @@ def advise(problem: str, measurements: Measured | None = None) -> Advice:
     standings.sort(key=lambda each: _error(metric, each.value))
     on_par = [each for each in standings if each.sampler in tied]
     best = _recommended(on_par)
+    right = [run for run in measurements.longer if run.problem == problem and run.right]
     notes = "; ".join(measurements.notes)
     return Advice(
         problem,
@@ -169,6 +174,7 @@ def advise(problem: str, measurements: Measured | None = None) -> Advice:
             for name in measurements.samplers
             if name not in values and f"{problem}/{name}" in measurements.words
         },
+        min(right, key=lambda run: run.seconds, default=None) if best.warnings else None,
     )
 
 
@@ -214,6 +220,10 @@ def _rhat_warning(rhat: pd.Series, at_most: float) -> list[str]:
         where = "" if above == n else f" at {above} of {n} seeds"
         return [f"chains disagree{where}: R-hat {float(rhat[rhat > at_most].mean()):.3g}"]
     return []
+
+
+def _described(run: LongerRun) -> str:
+    return f"{run.sampler}, {run.seconds:g} s per run, swd ratio {run.swd_ratio:.3g}"
 
 
 def _listed(standings: Sequence[Standing]) -> str:

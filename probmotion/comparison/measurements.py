@@ -1,16 +1,18 @@
 """Measurements of every sampler on every problem, shipped with the package.
 
 ``measured.csv`` contains the metrics that ``advise`` uses, ``measured.json`` the settings,
-problem descriptions and reasons for missing values.
+problem descriptions and reasons for missing values, and ``longer.csv`` runs with larger budgets on
+problems on which no sampler is right within that of the others.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from probmotion.comparison.results.headline_metrics import HEADLINE_METRICS
 from probmotion.files import written_whole
@@ -21,10 +23,10 @@ if TYPE_CHECKING:
 
     from probmotion.comparison.grid import Comparison
 
-__all__ = ["Measured", "measured", "save_measurements"]
+__all__ = ["LongerRun", "Measured", "measured", "save_longer", "save_measurements"]
 
 _FOLDER = Path(__file__).parent
-_ROWS, _SETTINGS = "measured.csv", "measured.json"
+_ROWS, _SETTINGS, _LONGER = "measured.csv", "measured.json", "longer.csv"
 _STORED_METRICS = (
     *HEADLINE_METRICS,
     "seconds",
@@ -35,6 +37,20 @@ _STORED_METRICS = (
     "rhat",
 )
 _DIGITS = 5  # significant digits of stored values
+
+
+class LongerRun(NamedTuple):
+    """Runs of a sampler with a larger budget.
+
+    ``seconds`` is the budget of a run, ``swd_ratio`` the mean over seeds, and ``right`` whether the
+    verdict on all seeds is "right".
+    """
+
+    problem: str
+    sampler: str
+    seconds: float
+    swd_ratio: float
+    right: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +75,8 @@ class Measured:
         Sampler names.
     words : dict of str
         One-word reason for missing draws, by ``problem/sampler``.
+    longer : tuple of LongerRun
+        Runs with larger budgets.
     """
 
     rows: pd.DataFrame
@@ -70,6 +88,7 @@ class Measured:
     problems: dict[str, str]
     samplers: list[str]
     words: dict[str, str]
+    longer: tuple[LongerRun, ...] = ()
 
 
 def save_measurements(comparison: Comparison, command: str, folder: str | Path = _FOLDER) -> None:
@@ -97,10 +116,23 @@ def save_measurements(comparison: Comparison, command: str, folder: str | Path =
         unfinished.write_text(json.dumps(settings, indent=1, ensure_ascii=False), encoding="utf-8")
 
 
+def save_longer(runs: Sequence[LongerRun], folder: str | Path = _FOLDER) -> None:
+    """Write runs with larger budgets, by default to the shipped file ``longer.csv``."""
+    import pandas as pd
+
+    table = pd.DataFrame(runs)
+    table["swd_ratio"] = [float(f"{value:.{_DIGITS}g}") for value in table["swd_ratio"]]
+    with written_whole(Path(folder) / _LONGER) as unfinished:
+        table.to_csv(unfinished, index=False)
+
+
 @cache
 def measured(folder: str | Path = _FOLDER) -> Measured:
     """Return the measurements in a folder, by default the shipped measurements."""
     import pandas as pd
 
     settings = json.loads((Path(folder) / _SETTINGS).read_text(encoding="utf-8"))
-    return Measured(pd.read_csv(Path(folder) / _ROWS), **settings)
+    longer: tuple[LongerRun, ...] = ()
+    if (path := Path(folder) / _LONGER).exists():
+        longer = tuple(map(LongerRun._make, pd.read_csv(path).itertuples(index=False)))
+    return Measured(pd.read_csv(Path(folder) / _ROWS), **settings, longer=longer)

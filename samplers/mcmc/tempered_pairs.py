@@ -131,7 +131,10 @@ class TemperedPairs:
                 others=suited(posterior),
             )
         if initial is not None:
-            raise ValueError(f"initial must be None, got {type(initial).__name__}")
+            raise ValueError(
+                f"initial must be None, got {type(initial).__name__}: chains start at the seeds of "
+                "the prior"
+            )
         check_count("draws", draws)
         check_count("chains", chains)
         start, stop = time.perf_counter(), Event()

@@ -137,7 +137,7 @@ class TemperedDensity(Density):
             raise ValueError(
                 f"log_density must be finite or -inf, got {total[bad]} at point {bad + 1} of "
                 f"{len(power)}, with likelihood to the power {power[bad]:.3g}, theta "
-                f"{points.theta[bad]}"
+                f"{points.theta[bad]}; return -inf where the density is 0"
             )
         return points
 

@@ -9,7 +9,12 @@ import pytest
 
 from probmotion.cli.main import main
 from probmotion.comparison import advise, compare, measured
-from probmotion.comparison.measurements import Measured, save_measurements
+from probmotion.comparison.measurements import (
+    LongerRun,
+    Measured,
+    save_longer,
+    save_measurements,
+)
 from probmotion.posteriors.sampling import sampler_names
 from probmotion.problems import load_problem, problem_names
 from probmotion.samplers import ExactSampler, ScoreDistillation
@@ -112,6 +117,31 @@ def test_samplers_with_warnings_are_recommended_only_without_alternative():
     alone = advise("p", measurements(good=GOOD, bad=BAD, more=doubtful))
     assert "no reliable sampler; best: good 0.997" in str(alone)
     assert "no reliable sampler; best: bad 2.05" in str(advise("p", measurements(bad=BAD)))
+
+
+def test_without_alternative_the_cheapest_longer_run_that_is_right_is_named():
+    runs = [
+        LongerRun("p", "bad", 600.0, 1.01, True),
+        LongerRun("p", "bad", 240.0, 1.0625, True),
+        LongerRun("p", "bad", 60.0, 1.4, False),
+        LongerRun("q", "bad", 30.0, 1.0, True),
+    ]
+    text = str(advise("p", replace(measurements(bad=BAD), longer=tuple(runs))))
+    assert "\nright with more time: bad, 240 s per run, swd ratio 1.06\n" in text
+    few = replace(measurements(bad=BAD), longer=tuple(runs[2:]))
+    assert "more time" not in str(advise("p", few))
+    enough = replace(measurements(good=GOOD, bad=BAD), longer=tuple(runs))
+    assert "more time" not in str(advise("p", enough))
+
+
+def test_longer_runs_are_saved_and_read(tmp_path):
+    problem = load_problem("gait", frames=4)
+    samplers = {"exact": ExactSampler()}
+    comparison = compare(problem, samplers, draws=12, seeds=2, workers=0, progress=False)
+    save_measurements(comparison, "a test", tmp_path)
+    runs = [LongerRun("gait", "exact", 60.0, 1.0625, True), LongerRun("p", "q", 9.0, 2.0, False)]
+    save_longer(runs, tmp_path)
+    assert measured(tmp_path).longer == tuple(runs)
 
 
 def test_a_single_sampler_is_recommended():

@@ -104,6 +104,8 @@ def test_stored_tables_are_up_to_date():
     table = "\n".join(which_sampler.advice_table(advices))
     for page in which_sampler.PAGES:
         assert table in page.read_text(encoding="utf-8")
+    longer = "\n".join(which_sampler.longer_table(which_sampler.measured().longer))
+    assert longer in (ROOT / "docs" / "which-sampler.md").read_text(encoding="utf-8")
     with pytest.raises(ValueError, match="one block called 'weather', got 0"):
         which_sampler.replace_block(README, "weather", "x")
 

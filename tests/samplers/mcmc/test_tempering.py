@@ -277,6 +277,34 @@ def test_a_density_that_is_nan_names_its_point(sampler, value):
         sampler.sample(faulty(value, 5.0), draws=2, progress=False)
 
 
+@dataclass(frozen=True, eq=False)
+class Hollow(Peaks):
+    """Likelihood that is NaN near one of its peaks, where draws of the prior rarely are."""
+
+    def log_density(self, positions):
+        xp = array_namespace(positions)
+        theta = positions[..., 0, 0, :]
+        square = xp.sum((theta - constant(self.centres[1], theta)) ** 2, axis=-1)
+        return xp.where(square < 0.04, math.nan, super().log_density(positions))
+
+
+@pytest.mark.parametrize("gradients", [True, False])
+@pytest.mark.parametrize("sampler", [TEMPERED, SMC], ids=lambda sampler: sampler.name)
+def test_a_density_that_is_nan_in_one_replica_names_its_power(sampler, gradients):
+    posterior = MotionPosterior(Broad(), Hollow(PEAKS.weights, PEAKS.centres, PEAKS.widths))
+    message = (
+        r"got nan at point \d+ of \d+, with likelihood to the power (0\.\d+|1), theta \[.*\]; "
+        "return -inf where the density is 0"
+    )
+    with pytest.raises(ValueError, match=message):
+        replace(sampler, gradients=gradients).sample(posterior, draws=500, seed=1, progress=False)
+
+
+def test_ladders_have_two_rungs_at_least():
+    with pytest.raises(ValueError, match="rungs must be an integer of at least 2, got 1"):
+        ParallelTempering(rungs=1)
+
+
 @pytest.mark.parametrize("sampler", [TEMPERED, SMC], ids=lambda sampler: sampler.name)
 def test_regions_without_likelihood_are_left(sampler):
     """Half of the prior has likelihood 0, as has one mode of the posterior."""
