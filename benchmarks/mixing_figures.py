@@ -3,7 +3,8 @@
 ``…_swd…``: the smallest mean ``swd_ratio``; of that sampler, ``…_mode_proportions_tv`` and
 ``…_rhat``: the largest over seeds, where there are modes. ``problems_without_a_right_sampler``:
 problems with exact draws or a reference on which the sampler that ``probmotion which`` recommends
-after 6 s has warnings, and no sampler here is right. Runs on these are stored for that command.
+after 6 s has warnings, and no sampler here is right. Results on those with warnings are stored in
+the package for that command.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ ROWS: tuple[tuple[str, str, float, int, Mapping[str, Sampler]], ...] = (
 
 
 def mixing_figures() -> Iterator[tuple[str, float]]:
-    """Yield names and values, and store the runs.
+    """Yield names and values; store results at the end.
 
     The smallest ``swd_ratio`` is infinite if no sampler finishes all seeds within the budget.
     """

@@ -5,8 +5,8 @@
 second on four cores. ``acceptance``: mean acceptance rate. ``ess_per_second``: bulk effective
 sample size of the worst coordinate. ``full_density_ms`` and ``full_density_batch_ms``: one density
 of a single point and of 64 points, on one thread. ``single_view_proposals_per_second``: Metropolis
-proposals of ``tempered-pairs``, on one thread; 40 of them evaluate the distance to one annotation,
-and the likelihood of the view accepts or rejects all 40.
+proposals of ``tempered-pairs``, on one thread. They evaluate the distance to a single annotation;
+the likelihood of the view accepts or rejects blocks of 40.
 ``memory_gib``: peak memory of a process that draws and saves ``draws_kept`` draws. The data are
 synthetic dances, or the salsa clips in ``--data FOLDER``.
 """

@@ -90,7 +90,8 @@ class Advice:
     without_draws : dict of str
         One-word reason for missing draws, by sampler.
     longer : LongerRun, optional
-        If the recommended sampler has warnings: the cheapest longer run that is right.
+        If the recommended sampler has warnings: the sampler that is right in the least time with a
+        larger budget.
     """
 
     problem: str
@@ -111,7 +112,7 @@ class Advice:
             f"measured with: {self.how}",
             f"ranked by: {self.metric}",
             f"{verdict}: {self.recommended}",
-            *([f"right with more time: {_described(self.longer)}"] if self.longer else []),
+            *([f"right with more time: {self.longer}"] if self.longer else []),
             f"on par: {_listed(self.tied)}",
             f"on par, with warnings: {_listed(self.tied_with_warnings)}",
             f"worse: {_listed(self.worse)}",
@@ -220,10 +221,6 @@ def _rhat_warning(rhat: pd.Series, at_most: float) -> list[str]:
         where = "" if above == n else f" at {above} of {n} seeds"
         return [f"chains disagree{where}: R-hat {float(rhat[rhat > at_most].mean()):.3g}"]
     return []
-
-
-def _described(run: LongerRun) -> str:
-    return f"{run.sampler}, {run.seconds:g} s per run, swd ratio {run.swd_ratio:.3g}"
 
 
 def _listed(standings: Sequence[Standing]) -> str:

@@ -1,8 +1,8 @@
 """Measurements of every sampler on every problem, shipped with the package.
 
 ``measured.csv`` contains the metrics that ``advise`` uses, ``measured.json`` the settings,
-problem descriptions and reasons for missing values, and ``longer.csv`` runs with larger budgets on
-problems on which no sampler is right within that of the others.
+problem descriptions and reasons for missing values, and ``longer.csv`` results with larger budgets
+on problems on which no sampler is right within the budget of ``measured.csv``.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _DIGITS = 5  # significant digits of stored values
 
 
 class LongerRun(NamedTuple):
-    """Runs of a sampler with a larger budget.
+    """Result of a sampler with a larger budget.
 
     ``seconds`` is the budget of a run, ``swd_ratio`` the mean over seeds, and ``right`` whether the
     verdict on all seeds is "right".
@@ -51,6 +51,9 @@ class LongerRun(NamedTuple):
     seconds: float
     swd_ratio: float
     right: bool
+
+    def __str__(self) -> str:
+        return f"{self.sampler}, {self.seconds:g} s per run, swd ratio {self.swd_ratio:.3g}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +79,7 @@ class Measured:
     words : dict of str
         One-word reason for missing draws, by ``problem/sampler``.
     longer : tuple of LongerRun
-        Runs with larger budgets.
+        Results with larger budgets.
     """
 
     rows: pd.DataFrame
@@ -117,10 +120,10 @@ def save_measurements(comparison: Comparison, command: str, folder: str | Path =
 
 
 def save_longer(runs: Sequence[LongerRun], folder: str | Path = _FOLDER) -> None:
-    """Write runs with larger budgets, by default to the shipped file ``longer.csv``."""
+    """Write results with larger budgets, by default to the shipped file ``longer.csv``."""
     import pandas as pd
 
-    table = pd.DataFrame(runs)
+    table = pd.DataFrame(runs, columns=list(LongerRun._fields))
     table["swd_ratio"] = [float(f"{value:.{_DIGITS}g}") for value in table["swd_ratio"]]
     with written_whole(Path(folder) / _LONGER) as unfinished:
         table.to_csv(unfinished, index=False)

@@ -142,6 +142,9 @@ def test_longer_runs_are_saved_and_read(tmp_path):
     runs = [LongerRun("gait", "exact", 60.0, 1.0625, True), LongerRun("p", "q", 9.0, 2.0, False)]
     save_longer(runs, tmp_path)
     assert measured(tmp_path).longer == tuple(runs)
+    save_longer([], tmp_path)
+    measured.cache_clear()
+    assert measured(tmp_path).longer == ()
 
 
 def test_a_single_sampler_is_recommended():
