@@ -19,7 +19,7 @@ from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.interaction.annotated_pairs import AnnotatedPairs
 from probmotion.interaction.annotations.sources import draw_annotations
 from probmotion.models.pose_pairs import pair_walk_kernels
-from probmotion.models.pose_pairs.annotation_moves import approach, transfer
+from probmotion.models.pose_pairs.annotation_moves import approach, scaled_depths, transfer
 from probmotion.models.pose_pairs.pair_densities import (
     image_axes,
     log_annotations,
@@ -255,6 +255,7 @@ def test_a_transfer_leads_from_one_annotation_to_the_other(prior, likelihood):
             continue
         towards = image_axes(pose, view, body, views)[2]
         sides = np.sign((near - near[body.parents]) @ np.array(towards))
+        assert (sides * scaled_depths(near, view, body, views) >= 0).all()
         transfer(near, sides, view, start, end, body, views, new)
         if approach(new, -1, 0.5, view, end, body, views, nearer) == -np.inf:
             continue
