@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from probmotion.extras import numba
-from probmotion.models.pose_pairs.joint_limits_frames import from_frame, least_rotation
-from probmotion.models.pose_pairs.pair_densities import (
+from probmotion.models.pose_pairs.joint_limits_frames import (
     Vector,
-    ViewAnnotations,
-    between,
-    image_axes,
+    dot,
+    from_frame,
+    in_frame,
+    least_rotation,
 )
+from probmotion.models.pose_pairs.pair_densities import ViewAnnotations, between, image_axes
 from probmotion.models.pose_pairs.pair_moves import Body
 
 __all__ = ["approach", "draw_sides", "log_side_probability", "scaled_depths", "transfer"]
@@ -56,7 +57,7 @@ def approach(
         if root < 0 or body.below[root, joint]:
             x = image[0, joint] - image[0, parent]
             y = image[1, joint] - image[1, parent]
-            z = _component(bone, towards)
+            z = dot(bone, towards)
             u, v = joints[0, joint] - joints[0, parent], joints[1, joint] - joints[1, parent]
             length = _length(bone)
             goal = _lifted(cosine * u - sine * v, sine * u + cosine * v, z, length)
@@ -89,7 +90,8 @@ def transfer(
     annotations. As in :func:`approach`, the local frame and its bones stay. The inverse exchanges
     the annotations and keeps the sides; −∞ if roots of an annotation (almost) coincide.
     """
-    right, up, towards = image_axes(pose, view, body, views)
+    frame = image_axes(pose, view, body, views)
+    right, up, _ = frame
     old, new, n_joints = views.prepared.joints[start], views.prepared.joints[end], len(pose)
     cosine, sine = _rotation_to_frame(_image(pose, right, up), old, body)
     first, log_volume = body.roots[0], 0.0
@@ -115,8 +117,7 @@ def transfer(
         u, v = new[0, joint] - new[0, parent], new[1, joint] - new[1, parent]
         x, y = new_cosine * u - new_sine * v, new_sine * u + new_cosine * v
         turn = least_rotation(start_bone, _lifted(x, y, side, length))
-        vector = (_component(bone, right), _component(bone, up), _component(bone, towards))
-        bone = from_frame((right, up, towards), from_frame(turn, vector))
+        bone = from_frame(frame, from_frame(turn, in_frame(frame, bone)))
         for axis in range(3):
             proposed[joint, axis] = proposed[parent, axis] + bone[axis]
     return log_volume
@@ -146,7 +147,7 @@ def scaled_depths(pose: np.ndarray, view: int, body: Body, views: ViewAnnotation
         parent = body.parents[joint]
         if parent >= 0:
             bone = between(pose, parent, joint)
-            depths[joint] = _component(bone, towards) / _length(bone) / _SIDE_SCALE
+            depths[joint] = dot(bone, towards) / _length(bone) / _SIDE_SCALE
     return depths
 
 
@@ -156,8 +157,8 @@ def _image(pose: np.ndarray, right: Vector, up: Vector) -> np.ndarray:
     image = np.empty((2, len(pose)))
     for joint in range(len(pose)):
         position = (pose[joint, 0], pose[joint, 1], pose[joint, 2])
-        image[0, joint] = _component(position, right)
-        image[1, joint] = _component(position, up)
+        image[0, joint] = dot(position, right)
+        image[1, joint] = dot(position, up)
     return image
 
 
@@ -190,13 +191,8 @@ def _distance(joints: np.ndarray, first: int, second: int) -> float:
 
 
 @numba.njit(cache=True, nogil=True)
-def _component(vector: Vector, axis: Vector) -> float:
-    return vector[0] * axis[0] + vector[1] * axis[1] + vector[2] * axis[2]
-
-
-@numba.njit(cache=True, nogil=True)
 def _length(vector: Vector) -> float:
-    return np.sqrt(_component(vector, vector))
+    return np.sqrt(dot(vector, vector))
 
 
 @numba.njit(cache=True, nogil=True)

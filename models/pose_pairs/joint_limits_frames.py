@@ -10,8 +10,8 @@ import numpy as np
 from probmotion.extras import numba
 
 __all__ = [
-    "NO_LENGTH", "Frame", "Vector", "cell_of", "closeness_of", "from_frame", "in_frame",
-    "least_rotation", "line_frame", "product", "unit",
+    "NO_LENGTH", "Frame", "Vector", "cell_of", "closeness_of", "cross", "dot", "from_frame",
+    "in_frame", "least_rotation", "line_frame", "product", "unit",
 ]  # fmt: skip
 
 Vector = tuple[float, float, float]
@@ -34,7 +34,7 @@ def cell_of(direction: Vector, rings: np.ndarray) -> int:
 @numba.njit(cache=True)
 def unit(v: Vector) -> Vector:
     """Return ``v`` normalised, or ``NO_LENGTH`` if its length is 0."""
-    length = np.sqrt(_dot(v, v))
+    length = np.sqrt(dot(v, v))
     if length < _TINY:
         return NO_LENGTH
     return (v[0] / length, v[1] / length, v[2] / length)
@@ -49,17 +49,17 @@ def line_frame(left: Vector, right: Vector, up: Vector) -> Frame:
     x = unit((left[0] - right[0], left[1] - right[1], left[2] - right[2]))
     if x == NO_LENGTH:
         x = _any_orthogonal(up)
-    along = _dot(x, up)
+    along = dot(x, up)
     y = unit((up[0] - along * x[0], up[1] - along * x[1], up[2] - along * x[2]))
     if y == NO_LENGTH:
         y = _any_orthogonal(x)
-    return (x, y, _cross(x, y))
+    return (x, y, cross(x, y))
 
 
 @numba.njit(cache=True)
 def in_frame(frame: Frame, direction: Vector) -> Vector:
     """Return the components of a direction in a frame."""
-    return (_dot(frame[0], direction), _dot(frame[1], direction), _dot(frame[2], direction))
+    return (dot(frame[0], direction), dot(frame[1], direction), dot(frame[2], direction))
 
 
 @numba.njit(cache=True)
@@ -76,7 +76,7 @@ def from_frame(frame: Frame, local: Vector) -> Vector:
 @numba.njit(cache=True)
 def least_rotation(a: Vector, b: Vector) -> Frame:
     """Return the rotation by the smallest angle from the unit vector ``a`` to ``b``."""
-    c = _dot(a, b)
+    c = dot(a, b)
     if c < -1.0 + 1e-9:
         # A half turn: the axis is arbitrary but deterministic.
         x, y, z = _any_orthogonal(a)
@@ -85,7 +85,7 @@ def least_rotation(a: Vector, b: Vector) -> Frame:
             (2.0 * x * y, 2.0 * y * y - 1.0, 2.0 * z * y),
             (2.0 * x * z, 2.0 * y * z, 2.0 * z * z - 1.0),
         )
-    v = _cross(a, b)
+    v = cross(a, b)
     k = 1.0 / (1.0 + c)
     return (
         (c + k * v[0] * v[0], k * v[0] * v[1] + v[2], k * v[0] * v[2] - v[1]),
@@ -101,12 +101,14 @@ def product(a: Frame, b: Frame) -> Frame:
 
 
 @numba.njit(cache=True)
-def _dot(a: Vector, b: Vector) -> float:
+def dot(a: Vector, b: Vector) -> float:
+    """Return the inner product of two vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @numba.njit(cache=True)
-def _cross(a: Vector, b: Vector) -> Vector:
+def cross(a: Vector, b: Vector) -> Vector:
+    """Return the cross product of two vectors."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 

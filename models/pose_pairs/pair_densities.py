@@ -15,17 +15,16 @@ from probmotion.interaction.geometry.nearest_kernels import (
     nearest_candidate,
     prepare_projection,
 )
+from probmotion.models.pose_pairs.joint_limits_frames import Vector, cross
 from probmotion.models.pose_pairs.joint_limits_kernels import LimitArrays, project_poses
 from probmotion.models.pose_pairs.pair_moves import Body, log_root_positions
 from probmotion.models.pose_pairs.penetration_kernels import total_depths
 
 __all__ = [
-    "Physics", "Vector", "ViewAnnotations", "between", "image_axes", "log_annotations",
+    "Physics", "ViewAnnotations", "between", "image_axes", "log_annotations",
     "log_lengths", "log_measure", "log_penetration", "log_prior", "log_prior_terms",
     "log_surrogate", "log_view", "log_views", "project_to_view", "write_limit_terms",
 ]  # fmt: skip
-
-Vector = tuple[float, float, float]
 
 
 class Physics(NamedTuple):
@@ -217,8 +216,8 @@ def image_axes(
     across = (0.0, 1.0, 0.0) if y <= z else (0.0, 0.0, 1.0)
     if x <= y and x <= z:
         across = (1.0, 0.0, 0.0)
-    right = _unit(_cross(across, towards))
-    return right, _cross(towards, right), towards
+    right = _unit(cross(across, towards))
+    return right, cross(towards, right), towards
 
 
 @numba.njit(cache=True, nogil=True)
@@ -230,7 +229,7 @@ def _local_frame(pose: np.ndarray, body: Body) -> tuple[Vector, Vector, Vector]:
         x, y, z = x + along[0], y + along[1], z + along[2]
     i = _unit(between(pose, body.roots[0], body.roots[1]))
     j = _unit((x, y, z))
-    return i, j, _cross(i, j)
+    return i, j, cross(i, j)
 
 
 # Tuples avoid the allocation of small arrays.
@@ -245,8 +244,3 @@ def between(pose: np.ndarray, start: int, end: int) -> Vector:
 def _unit(v: Vector) -> Vector:
     size = max(np.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2), 1e-300)
     return (v[0] / size, v[1] / size, v[2] / size)
-
-
-@numba.njit(cache=True, nogil=True)
-def _cross(a: Vector, b: Vector) -> Vector:
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
