@@ -26,11 +26,14 @@ ROWS: tuple[tuple[str, str, float, int, Mapping[str, Sampler]], ...] = (
     ("gait_noisy3d_best_swd_30s", "gait-noisy3d", 30.0, 4, BOTH),
     ("walk_vae_monocular_best_swd_60s", "walk-vae-monocular", 60.0, 4, BOTH),
     # Runs have one core: 60 s are 30 s of two cores, too short for more than one chain.
+    ("salsa_pairs_swd_6s", "salsa-pairs", 12.0, 1, PAIRS),
     ("salsa_pairs_swd_30s", "salsa-pairs", 60.0, 1, PAIRS),
     ("salsa_pairs_swd_120s", "salsa-pairs", 240.0, 4, PAIRS),
     ("salsa_pairs_swd_300s", "salsa-pairs", 600.0, 4, PAIRS),
+    ("dance_pairs_swd_6s", "dance-pairs", 12.0, 1, PAIRS),
     ("dance_pairs_swd_30s", "dance-pairs", 60.0, 1, PAIRS),
     ("dance_pairs_swd_120s", "dance-pairs", 240.0, 4, PAIRS),
+    ("dance_pairs_swd_300s", "dance-pairs", 600.0, 4, PAIRS),
 )
 """Name, problem, seconds per run, chains, and samplers."""
 

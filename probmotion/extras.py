@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import zarr as zarr
     from torch import nn as nn
 
-__all__ = ["OPTIONAL", "is_installed"]
+__all__ = ["NO_ALLOCATION", "OPTIONAL", "is_installed"]
 
 OPTIONAL = {
     "torch": "torch",
@@ -39,6 +39,10 @@ OPTIONAL = {
     "skimage": "images",
 }
 """Extra of this package that installs a library, by the name to import from this module."""
+
+NO_ALLOCATION = {"cache": True, "nogil": True, "_nrt": False}
+"""Options of ``numba.njit`` for functions that create no arrays. Without them, functions count
+references to each array of their arguments, which takes most of the time of short functions."""
 
 _MODULES = {"nn": "torch.nn"}  # if other than the name
 

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from probmotion.extras import numba
+from probmotion.extras import NO_ALLOCATION, numba
 
 __all__ = [
-    "NO_LENGTH", "Frame", "Vector", "cell_of", "closeness_of", "cross", "dot", "from_frame",
-    "in_frame", "least_rotation", "line_frame", "product", "unit",
+    "NO_LENGTH", "Frame", "Vector", "between", "cell_of", "closeness_of", "cross", "dot",
+    "from_frame", "in_frame", "least_rotation", "length_of", "line_frame", "overwrite", "product",
+    "unit",
 ]  # fmt: skip
 
 Vector = tuple[float, float, float]
@@ -20,7 +21,7 @@ NO_LENGTH = (0.0, 0.0, 0.0)  # direction of a vector of length 0
 _TINY = 1e-12  # length below which a vector counts as 0
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def cell_of(direction: Vector, rings: np.ndarray) -> int:
     """Return the index of the cell of a unit vector; ``rings`` are about the second axis."""
     height = min(1.0, max(-1.0, direction[1]))
@@ -31,16 +32,16 @@ def cell_of(direction: Vector, rings: np.ndarray) -> int:
     return rings[ring, 1] + index % cells
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def unit(v: Vector) -> Vector:
     """Return ``v`` normalised, or ``NO_LENGTH`` if its length is 0."""
-    length = np.sqrt(dot(v, v))
+    length = length_of(v)
     if length < _TINY:
         return NO_LENGTH
     return (v[0] / length, v[1] / length, v[2] / length)
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def line_frame(left: Vector, right: Vector, up: Vector) -> Frame:
     """Return the frame with left axis left − right and the up axis closest to ``up``.
 
@@ -56,13 +57,13 @@ def line_frame(left: Vector, right: Vector, up: Vector) -> Frame:
     return (x, y, cross(x, y))
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def in_frame(frame: Frame, direction: Vector) -> Vector:
     """Return the components of a direction in a frame."""
     return (dot(frame[0], direction), dot(frame[1], direction), dot(frame[2], direction))
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def from_frame(frame: Frame, local: Vector) -> Vector:
     """Return the direction with components ``local`` in a frame."""
     x, y, z = frame
@@ -73,7 +74,7 @@ def from_frame(frame: Frame, local: Vector) -> Vector:
     )
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def least_rotation(a: Vector, b: Vector) -> Frame:
     """Return the rotation by the smallest angle from the unit vector ``a`` to ``b``."""
     c = dot(a, b)
@@ -94,25 +95,48 @@ def least_rotation(a: Vector, b: Vector) -> Frame:
     )
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def product(a: Frame, b: Frame) -> Frame:
     """Return the product of two 3 × 3 matrices."""
     return (from_frame(a, b[0]), from_frame(a, b[1]), from_frame(a, b[2]))
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
+def overwrite(target: np.ndarray, source: np.ndarray) -> None:
+    """Copy an array; the assignment of a slice would allocate a buffer."""
+    for i in range(source.size):
+        target.flat[i] = source.flat[i]
+
+
+@numba.njit(**NO_ALLOCATION)
+def between(pose: np.ndarray, start: int, end: int) -> Vector:
+    """Return the vector from one joint to another."""
+    return (
+        pose[end, 0] - pose[start, 0],
+        pose[end, 1] - pose[start, 1],
+        pose[end, 2] - pose[start, 2],
+    )
+
+
+@numba.njit(**NO_ALLOCATION)
+def length_of(v: Vector) -> float:
+    """Return the length of a vector."""
+    return np.sqrt(dot(v, v))
+
+
+@numba.njit(**NO_ALLOCATION)
 def dot(a: Vector, b: Vector) -> float:
     """Return the inner product of two vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def cross(a: Vector, b: Vector) -> Vector:
     """Return the cross product of two vectors."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def _any_orthogonal(v: Vector) -> Vector:
     """Return a deterministic unit vector orthogonal to ``v``."""
     x, y, z = abs(v[0]), abs(v[1]), abs(v[2])

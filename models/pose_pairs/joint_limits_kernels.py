@@ -10,22 +10,28 @@ from typing import NamedTuple
 
 import numpy as np
 
-from probmotion.extras import numba
+from probmotion.extras import NO_ALLOCATION, numba
 from probmotion.models.pose_pairs.joint_limits_frames import (
     NO_LENGTH,
     Frame,
     Vector,
+    between,
     cell_of,
     from_frame,
     in_frame,
     least_rotation,
+    length_of,
     line_frame,
+    overwrite,
     product,
     unit,
 )  # fmt: skip
 from probmotion.motion.skeleton import Skeleton
 
-__all__ = ["PARTS", "LimitArrays", "local_directions", "project_poses"]
+__all__ = [
+    "PARTS", "Corrections", "LimitArrays", "correct_person", "corrections", "local_directions",
+    "project_poses",
+]  # fmt: skip
 
 PARTS = ("hip", "knee", "ankle", "chest", "shoulder", "elbow", "wrist", "neck", "head")
 """Bones with a table, by end joint; shared by both sides."""
@@ -53,39 +59,47 @@ class LimitArrays(NamedTuple):
     tilt: float  # sine of the maximum tilt of the spine
 
 
+class Corrections(NamedTuple):
+    """Bones of one person, by end joint, before and after a traversal."""
+
+    given: np.ndarray  # (17, 3), unit vectors
+    directions: np.ndarray  # (17, 3), unit vectors after correction
+    valid: np.ndarray  # (17,), bool
+    local: np.ndarray  # (17, 2, 3), directions of the parent and the bone in the bone's frame
+    shifts: np.ndarray  # (17, 3), displacements of the joints, metres
+
+
 class Walk(NamedTuple):
-    """State of the traversal of one person."""
+    """Arguments of the traversal of one person."""
 
     limits: LimitArrays
     correct: bool  # whether invalid bones are corrected
-    directions: np.ndarray  # (17, 3), unit vectors of the bones by end joint
-    valid: np.ndarray  # (17,), bool
-    local: np.ndarray  # (17, 2, 3), directions of the parent and the bone in the bone's frame
+    bones: Corrections
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def _row(rows: np.ndarray, number: int) -> Vector:
     return (rows[number, 0], rows[number, 1], rows[number, 2])
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def _set_row(rows: np.ndarray, number: int, v: Vector) -> None:
     rows[number, 0], rows[number, 1], rows[number, 2] = v
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def _mirrored(v: Vector) -> Vector:
     return (-v[0], v[1], v[2])
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def _side_frame(frame: Frame, side: int) -> Frame:
     """Return the frame for bones of the left (0) or right (1) side."""
     left, up, forward = frame
     return frame if side == 0 else ((-left[0], -left[1], -left[2]), up, forward)
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def _rotate_bone(directions: np.ndarray, joint: int, new: Vector, last: int) -> None:
     """Set the direction of a bone and rotate its descendants, up to joint ``last``."""
     old = _row(directions, joint)
@@ -97,7 +111,7 @@ def _rotate_bone(directions: np.ndarray, joint: int, new: Vector, last: int) -> 
         _set_row(directions, below, unit(from_frame(turn, _row(directions, below))))
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def _nearest_allowed(u: Vector, part: int, row: int, limits: LimitArrays) -> Vector:
     """Return the point at which the path from ``u`` to the nearest allowed centre becomes valid."""
     best, closest = 0, -2.0
@@ -120,7 +134,7 @@ def _nearest_allowed(u: Vector, part: int, row: int, limits: LimitArrays) -> Vec
     return _interpolated(u, centre, inside)
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def _interpolated(a: Vector, b: Vector, fraction: float) -> Vector:
     """Return the normalised linear interpolation of two unit vectors."""
     return unit(
@@ -132,13 +146,13 @@ def _interpolated(a: Vector, b: Vector, fraction: float) -> Vector:
     )
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def _check(part: int, joint: int, last: int, frame: Frame, condition: Vector, walk: Walk) -> Vector:
     """Check and correct a bone given its parent's direction; return its direction in ``frame``.
 
     A bone of length 0 is valid and gets its mean direction.
     """
-    limits, correct, directions, valid, local = walk
+    limits, correct, (_, directions, valid, local, _) = walk
     direction = _row(directions, joint)
     valid[joint] = True
     if direction == NO_LENGTH:
@@ -156,14 +170,14 @@ def _check(part: int, joint: int, last: int, frame: Frame, condition: Vector, wa
     return u
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def _walk_person(walk: Walk) -> None:
     """Check the 16 bones, parents first, correcting ``directions`` in place.
 
     ``local`` receives the directions of each parent and bone. Frames depend only on bones already
     corrected, and corrections do not change frames already used, so the result is valid.
     """
-    limits, correct, directions, valid, local = walk
+    limits, correct, (_, directions, valid, local, _) = walk
     pelvis = line_frame(
         _row(directions, LEFT_HIP), _row(directions, RIGHT_HIP), _row(directions, SPINE)
     )
@@ -203,10 +217,10 @@ def _walk_person(walk: Walk) -> None:
         _limb(ELBOW, joint, sided, in_frame(sided, _row(directions, joint)), walk)
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def _check_spine(pelvis: Frame, walk: Walk) -> Vector:
     """Check the tilt of the spine in the left-up plane of the pelvis and return its direction."""
-    limits, correct, directions, valid, local = walk
+    limits, correct, (_, directions, valid, local, _) = walk
     if _row(directions, SPINE) == NO_LENGTH:
         _set_row(directions, SPINE, pelvis[1])
     u = in_frame(pelvis, _row(directions, SPINE))
@@ -221,7 +235,7 @@ def _check_spine(pelvis: Frame, walk: Walk) -> Vector:
     return u
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def _limb(part: int, joint: int, frame: Frame, condition: Vector, walk: Walk) -> None:
     """Check the two bones below ``joint``: thigh and shin, or upper arm and forearm."""
     first = _check(part, joint + 1, joint + 2, frame, condition, walk)
@@ -229,16 +243,11 @@ def _limb(part: int, joint: int, frame: Frame, condition: Vector, walk: Walk) ->
     _check(part + 1, joint + 2, joint + 2, below, first, walk)
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def _directions(pose: np.ndarray, tree: np.ndarray, directions: np.ndarray) -> None:
     """Write the unit vector of each bone to ``directions``; 0 for bones of length 0."""
     for joint in range(1, N_JOINTS):
-        end, start = tree[joint], tree[_PARENTS[joint]]
-        bone = (
-            pose[end, 0] - pose[start, 0],
-            pose[end, 1] - pose[start, 1],
-            pose[end, 2] - pose[start, 2],
-        )
+        bone = between(pose, tree[_PARENTS[joint]], tree[joint])
         _set_row(directions, joint, unit(bone))
 
 
@@ -250,39 +259,51 @@ def project_poses(
 
     ``trees`` (K, 17) contains the joints of each person in the order of ``person17``.
     """
-    n = len(poses)
-    nearest = poses.copy()
-    valid = np.ones(poses.shape[:2], dtype=np.bool_)
-    directions, local = np.zeros((N_JOINTS, 3)), np.zeros((N_JOINTS, 2, 3))
-    of_person = np.ones(N_JOINTS, dtype=np.bool_)
-    for pose in range(n):
+    nearest, valid = poses.copy(), np.ones(poses.shape[:2], dtype=np.bool_)
+    bones = corrections()
+    for pose in range(len(poses)):
         for tree in trees:
-            _directions(poses[pose], tree, directions)
-            before = directions.copy()
-            _walk_person(Walk(limits, True, directions, of_person, local))
-            if of_person.all():
-                continue
+            correct_person(poses[pose], tree, limits, bones)
             for joint in range(1, N_JOINTS):
-                end, start = tree[joint], tree[_PARENTS[joint]]
-                valid[pose, end] = of_person[joint]
-                length = 0.0
+                valid[pose, tree[joint]] = bones.valid[joint]
                 for i in range(3):
-                    length += (poses[pose, end, i] - poses[pose, start, i]) ** 2
-                # Add only the change of direction, so that unchanged bones are not rounded.
-                for i in range(3):
-                    rotated = np.sqrt(length) * (directions[joint, i] - before[joint, i])
-                    translated = nearest[pose, start, i] - poses[pose, start, i]
-                    nearest[pose, end, i] = poses[pose, end, i] + translated + rotated
+                    nearest[pose, tree[joint], i] += bones.shifts[joint, i]
     return valid, nearest
+
+
+@numba.njit(**NO_ALLOCATION)
+def correct_person(
+    pose: np.ndarray, tree: np.ndarray, limits: LimitArrays, bones: Corrections
+) -> None:
+    """Write the bones of a person and the displacements to a nearby valid pose to ``bones``."""
+    given, directions, _, _, shifts = bones
+    _directions(pose, tree, given)
+    overwrite(directions, given)
+    _walk_person(Walk(limits, True, bones))
+    for joint in range(1, N_JOINTS):
+        parent = _PARENTS[joint]
+        length = length_of(between(pose, tree[parent], tree[joint]))
+        # Only the change of direction counts, so that unchanged bones are not rounded.
+        for i in range(3):
+            rotated = length * (directions[joint, i] - given[joint, i])
+            shifts[joint, i] = shifts[parent, i] + rotated
+
+
+@numba.njit(cache=True)
+def corrections() -> Corrections:
+    """Return arrays that :func:`correct_person` overwrites."""
+    vectors = np.zeros((3, N_JOINTS, 3))
+    valid, local = np.ones(N_JOINTS, dtype=np.bool_), np.zeros((N_JOINTS, 2, 3))
+    return Corrections(vectors[0], vectors[1], valid, local, vectors[2])
 
 
 @numba.njit(cache=True)
 def local_directions(poses: np.ndarray, limits: LimitArrays) -> np.ndarray:
     """Return the parent's and the bone's direction in each bone's frame, (n, 17, 2, 3)."""
-    local = np.zeros((len(poses), N_JOINTS, 2, 3))
-    directions, of_person = np.zeros((N_JOINTS, 3)), np.ones(N_JOINTS, dtype=np.bool_)
+    local, bones = np.empty((len(poses), N_JOINTS, 2, 3)), corrections()
     tree = np.arange(N_JOINTS)
     for pose in range(len(poses)):
-        _directions(poses[pose], tree, directions)
-        _walk_person(Walk(limits, False, directions, of_person, local[pose]))
+        _directions(poses[pose], tree, bones.directions)
+        _walk_person(Walk(limits, False, bones))
+        local[pose] = bones.local
     return local

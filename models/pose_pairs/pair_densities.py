@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from probmotion.extras import numba
+from probmotion.extras import NO_ALLOCATION, numba
 from probmotion.interaction.geometry.nearest_kernels import (
     INTERACTION,
     Prepared,
@@ -15,15 +15,26 @@ from probmotion.interaction.geometry.nearest_kernels import (
     nearest_candidate,
     prepare_projection,
 )
-from probmotion.models.pose_pairs.joint_limits_frames import Vector, cross
-from probmotion.models.pose_pairs.joint_limits_kernels import LimitArrays, project_poses
+from probmotion.models.pose_pairs.joint_limits_frames import (
+    Vector,
+    between,
+    cross,
+    dot,
+    length_of,
+)
+from probmotion.models.pose_pairs.joint_limits_kernels import (
+    Corrections,
+    LimitArrays,
+    correct_person,
+    corrections,
+)
 from probmotion.models.pose_pairs.pair_moves import Body, log_root_positions
-from probmotion.models.pose_pairs.penetration_kernels import total_depths
+from probmotion.models.pose_pairs.penetration_kernels import total_depth
 
 __all__ = [
-    "Physics", "ViewAnnotations", "between", "image_axes", "log_annotations",
-    "log_lengths", "log_measure", "log_penetration", "log_prior", "log_prior_terms",
-    "log_surrogate", "log_view", "log_views", "project_to_view", "write_limit_terms",
+    "Physics", "ViewAnnotations", "Workspace", "image_axes", "log_annotations", "log_lengths",
+    "log_measure", "log_penetration", "log_prior", "log_prior_terms", "log_surrogate", "log_view",
+    "log_views", "project_to_view", "workspace", "write_image", "write_limit_terms",
 ]  # fmt: skip
 
 
@@ -52,20 +63,49 @@ class ViewAnnotations(NamedTuple):
     noise: float
 
 
+class Workspace(NamedTuple):
+    """Arrays that compiled functions overwrite, one set per thread."""
+
+    pose: np.ndarray  # (J, 3), a proposal
+    parts: np.ndarray  # (2 + 2 K,), terms of its log prior
+    bones: Corrections
+    spheres: np.ndarray  # (bones, 4), of capsules
+    image: np.ndarray  # (2, J)
+    errors: np.ndarray  # (2, J)
+    edges: np.ndarray  # (n_edges,)
+
+
 @numba.njit(cache=True, nogil=True)
-def log_prior_terms(pose: np.ndarray, body: Body, physics: Physics, parts: np.ndarray) -> None:
+def workspace(body: Body, physics: Physics, n_edges: int) -> Workspace:
+    """Return arrays for a prior, and for graphs of annotations of at most ``n_edges`` edges."""
+    n_joints = len(body.parents)
+    return Workspace(
+        np.empty((n_joints, 3)),
+        np.empty(2 + 2 * len(body.roots)),
+        corrections(),
+        np.empty((len(physics.bones), 4)),
+        np.empty((2, n_joints)),
+        np.empty((2, n_joints)),
+        np.empty(n_edges),
+    )
+
+
+@numba.njit(**NO_ALLOCATION)
+def log_prior_terms(
+    pose: np.ndarray, body: Body, physics: Physics, parts: np.ndarray, work: Workspace
+) -> None:
     """Write the terms of the log prior of K people to ``parts`` (2 + 2 K,).
 
     The terms are those of :func:`log_measure` and :func:`log_penetration`, the joint-limit term of
     each person (eq. 2), and the number of invalid angles of each person.
     """
     parts[0] = log_measure(pose, body)
-    parts[1] = log_penetration(pose, physics)
+    parts[1] = log_penetration(pose, physics, work)
     for person in range(len(body.roots)):
-        write_limit_terms(pose, person, physics, parts)
+        write_limit_terms(pose, person, physics, parts, work)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(**NO_ALLOCATION)
 def log_prior(parts: np.ndarray, physics: Physics) -> float:
     """Return the log prior, up to a constant, from the terms of :func:`log_prior_terms`."""
     people = len(parts) // 2 - 1
@@ -111,76 +151,81 @@ def log_annotations(
         logs[position] = -0.5 * (logs[position] / views.noise) ** 2
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(**NO_ALLOCATION)
 def log_surrogate(
     pose: np.ndarray,
     view: int,
     annotation: int,
     body: Body,
     views: ViewAnnotations,
-    errors: np.ndarray,
-    terms: np.ndarray,
+    work: Workspace,
 ) -> float:
-    """Return −d²/2σ_l² of one annotation, with d on its graph only (ten times faster).
-
-    ``errors`` (2, J) and ``terms`` (edges,) are workspace arrays.
-    """
-    if views.prepared.measure == INTERACTION:
-        # Neither the rotation nor differences of joints depend on the middle.
-        image = project_to_view(pose, view, body, views).T
-        distance = annotation_graph_distance(image, annotation, views.prepared, errors, terms)
-    else:
-        # Distances without a graph have no cheaper surrogate.
-        image = project_to_view(pose, view, body, views)
-        prepared, distances = prepare_projection(image, views.prepared), np.empty(1)
-        distances_to(prepared, np.array([annotation]), views.prepared, distances)
-        distance = distances[0]
+    """Return −d²/2σ_l² of one annotation, with d on its graph only (ten times faster)."""
+    if views.prepared.measure != INTERACTION:
+        return _log_annotation(pose, view, annotation, body, views)
+    right, up, _ = image_axes(pose, view, body, views)
+    # Neither the rotation nor differences of joints depend on the middle.
+    write_image(pose, right, up, work.image)
+    distance = annotation_graph_distance(
+        work.image, annotation, views.prepared, work.errors, work.edges
+    )
     return -0.5 * (distance / views.noise) ** 2
 
 
-@numba.njit(cache=True, nogil=True)
+# By default, options are those of the caller, which allocates no arrays.
+@numba.njit(cache=True, nogil=True, _nrt=True)
+def _log_annotation(
+    pose: np.ndarray, view: int, annotation: int, body: Body, views: ViewAnnotations
+) -> float:
+    """Return −d²/2σ_l² of one annotation; distances without a graph have no cheaper surrogate."""
+    prepared = prepare_projection(project_to_view(pose, view, body, views), views.prepared)
+    distances = np.empty(1)
+    distances_to(prepared, np.array([annotation]), views.prepared, distances)
+    return -0.5 * (distances[0] / views.noise) ** 2
+
+
+@numba.njit(**NO_ALLOCATION)
 def log_measure(pose: np.ndarray, body: Body) -> float:
     """Return the log density of normal log lengths and root positions, 0 at the seed."""
     squares = log_lengths(pose, body)[1]
     return log_root_positions(pose, body) - 0.5 * squares / body.bone_noise**2
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(**NO_ALLOCATION)
 def log_lengths(pose: np.ndarray, body: Body) -> tuple[float, float]:
     """Return Σ log(l/l₀) and Σ log²(l/l₀) over bones of length l, l₀ in the seed."""
     total, squares = 0.0, 0.0
     for joint in range(len(pose)):
         parent = body.parents[joint]
         if parent >= 0:
-            square, seed_square = 0.0, 0.0
-            for i in range(3):
-                square += (pose[joint, i] - pose[parent, i]) ** 2
-                seed_square += (body.seed[joint, i] - body.seed[parent, i]) ** 2
-            change = 0.5 * np.log(square / seed_square)
+            bone, seed_bone = between(pose, parent, joint), between(body.seed, parent, joint)
+            change = 0.5 * np.log(dot(bone, bone) / dot(seed_bone, seed_bone))
             total += change
             squares += change**2
     return total, squares
 
 
-@numba.njit(cache=True, nogil=True)
-def log_penetration(pose: np.ndarray, physics: Physics) -> float:
+@numba.njit(**NO_ALLOCATION)
+def log_penetration(pose: np.ndarray, physics: Physics, work: Workspace) -> float:
     """Return −w ρ²/2σ_p² with penetration depth ρ, weight w and position noise σ_p (eq. 2)."""
-    poses = pose.reshape(1, len(pose), 3)
-    depth = total_depths(poses, physics.bones, physics.radii, physics.pairs)[0]
+    depth = total_depth(pose, physics.bones, physics.radii, physics.pairs, work.spheres)
     return -0.5 * physics.penetration_weight * (depth / physics.position_noise) ** 2
 
 
-@numba.njit(cache=True, nogil=True)
-def write_limit_terms(pose: np.ndarray, person: int, physics: Physics, parts: np.ndarray) -> None:
+@numba.njit(**NO_ALLOCATION)
+def write_limit_terms(
+    pose: np.ndarray, person: int, physics: Physics, parts: np.ndarray, work: Workspace
+) -> None:
     """Write a person's −‖X − X̂‖²/2σ_p², X̂ the projected pose, and number of invalid angles."""
-    poses = pose.reshape(1, len(pose), 3)
-    valid, nearest = project_poses(poses, physics.trees[person : person + 1], physics.limits)
-    square = 0.0
-    for joint in range(len(pose)):
+    bones = work.bones
+    correct_person(pose, physics.trees[person], physics.limits, bones)
+    square, n_invalid = 0.0, 0
+    for joint in range(len(bones.valid)):
+        n_invalid += not bones.valid[joint]
         for i in range(3):
-            square += (pose[joint, i] - nearest[0, joint, i]) ** 2
+            square += bones.shifts[joint, i] ** 2
     parts[2 + person] = -0.5 * square / physics.position_noise**2
-    parts[2 + len(physics.trees) + person] = valid.size - valid.sum()
+    parts[2 + len(physics.trees) + person] = n_invalid
 
 
 @numba.njit(cache=True, nogil=True)
@@ -191,15 +236,20 @@ def project_to_view(pose: np.ndarray, view: int, body: Body, views: ViewAnnotati
     the image plane, which the alignment with annotations removes.
     """
     right, up, _ = image_axes(pose, view, body, views)
-    image = np.empty((len(pose), 2))
+    image = np.empty((2, len(pose)))
+    write_image(pose, right, up, image)
+    return np.ascontiguousarray(image.T)
+
+
+@numba.njit(**NO_ALLOCATION)
+def write_image(pose: np.ndarray, right: Vector, up: Vector, image: np.ndarray) -> None:
+    """Write the coordinates of the joints along two axes to ``image`` (2, J)."""
     for joint in range(len(pose)):
-        x, y, z = pose[joint, 0], pose[joint, 1], pose[joint, 2]
-        image[joint, 0] = right[0] * x + right[1] * y + right[2] * z
-        image[joint, 1] = up[0] * x + up[1] * y + up[2] * z
-    return image
+        position = (pose[joint, 0], pose[joint, 1], pose[joint, 2])
+        image[0, joint], image[1, joint] = dot(position, right), dot(position, up)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(**NO_ALLOCATION)
 def image_axes(
     pose: np.ndarray, view: int, body: Body, views: ViewAnnotations
 ) -> tuple[Vector, Vector, Vector]:
@@ -220,7 +270,7 @@ def image_axes(
     return right, cross(towards, right), towards
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(**NO_ALLOCATION)
 def _local_frame(pose: np.ndarray, body: Body) -> tuple[Vector, Vector, Vector]:
     """Return i, j, k of :func:`~probmotion.interaction.annotations.local_frames.local_frames`."""
     x, y, z = 0.0, 0.0, 0.0
@@ -232,15 +282,7 @@ def _local_frame(pose: np.ndarray, body: Body) -> tuple[Vector, Vector, Vector]:
     return i, j, cross(i, j)
 
 
-# Tuples avoid the allocation of small arrays.
-@numba.njit(cache=True, nogil=True)
-def between(pose: np.ndarray, start: int, end: int) -> Vector:
-    """Return the vector from one joint to another."""
-    (a, b, c), (x, y, z) = pose[start], pose[end]
-    return (x - a, y - b, z - c)
-
-
-@numba.njit(cache=True, nogil=True)
+@numba.njit(**NO_ALLOCATION)
 def _unit(v: Vector) -> Vector:
-    size = max(np.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2), 1e-300)
+    size = max(length_of(v), 1e-300)
     return (v[0] / size, v[1] / size, v[2] / size)

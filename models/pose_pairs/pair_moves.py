@@ -12,7 +12,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from probmotion.extras import numba
+from probmotion.extras import NO_ALLOCATION, numba
+from probmotion.models.pose_pairs.joint_limits_frames import (
+    Frame,
+    Vector,
+    between,
+    from_frame,
+    length_of,
+    overwrite,
+)
 
 __all__ = [
     "APPROACH", "HINGE", "SHIFT", "SLIDE", "STRETCH", "SWING", "TURN", "Body", "log_root_positions",
@@ -72,7 +80,7 @@ def moves_of(body: Body) -> np.ndarray:
     return np.array(moves, dtype=np.int64)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(**NO_ALLOCATION)
 def propose(
     pose: np.ndarray,
     move: np.ndarray,
@@ -87,62 +95,46 @@ def propose(
     With ``depth``, shifts are along z, and turns, swings and slides about axes perpendicular to z.
     """
     kind, joint, other = move
-    proposed[:] = pose
-    parent = body.parents[joint]
-    turn, vector, centre = np.empty((3, 3)), np.empty(3), np.zeros(3)
-    for i in range(3):
-        vector[i] = size * rng.standard_normal()
+    overwrite(proposed, pose)
+    parent, below = body.parents[joint], body.below[joint]
+    x = size * rng.standard_normal()
+    y = size * rng.standard_normal()
+    z = size * rng.standard_normal()
     if depth and kind == SHIFT:
-        vector[:2] = 0.0
+        x, y = 0.0, 0.0
     elif depth:
-        vector[2] = 0.0
-    if kind in (TURN, SWING):
-        if kind == SWING:
-            centre[:] = pose[parent]
-        else:
-            n_joints = 0
-            for k in range(len(pose)):
-                if body.below[joint, k]:
-                    for i in range(3):
-                        centre[i] += pose[k, i]
-                    n_joints += 1
-            centre /= n_joints
-        _rotation(vector, turn)
-        _turn_about(proposed, body.below[joint], centre, turn)
-    elif kind in (SHIFT, STRETCH, SLIDE):
-        if kind == STRETCH:
-            factor = np.exp(vector[0]) - 1.0
-            for i in range(3):
-                vector[i] = factor * (pose[joint, i] - pose[parent, i])
-        elif kind == SLIDE:
-            _rotation(vector, turn)
-            for i in range(3):
-                vector[i] = -(pose[joint, i] - pose[parent, i])
-                for m in range(3):
-                    vector[i] += turn[i, m] * (pose[joint, m] - pose[parent, m])
-        for k in range(len(pose)):
-            if body.below[joint, k]:
-                for i in range(3):
-                    proposed[k, i] += vector[i]
+        z = 0.0
+    if kind == TURN:
+        _turn_about(proposed, below, _middle(pose, below), _rotation((x, y, z)))
+        return
+    if kind == SHIFT:
+        _shift(proposed, below, (x, y, z))
+        return
+    bone = between(pose, parent, joint)
+    if kind == SWING:
+        _turn_about(proposed, below, _position(pose, parent), _rotation((x, y, z)))
+    elif kind == STRETCH:
+        ratio = np.exp(x)
+        _shift(proposed, below, _change(bone, (ratio * bone[0], ratio * bone[1], ratio * bone[2])))
+    elif kind == SLIDE:
+        _shift(proposed, below, _change(bone, from_frame(_rotation((x, y, z)), bone)))
     else:
-        angle = vector[0]
+        angle = x
         if rng.random() < _UNIFORM_ANGLES:
             angle = np.pi * (2.0 * rng.random() - 1.0)
         # Rotation about the line between two joints preserves both bone lengths.
-        axis = pose[other] - pose[parent if kind == CRANK else joint]
-        length = np.sqrt((axis**2).sum())
+        x, y, z = between(pose, parent if kind == CRANK else joint, other)
+        length = length_of((x, y, z))
         if length == 0:
             return
-        _rotation(axis * (angle / length), turn)
-        rotated = np.zeros(len(pose), dtype=np.bool_)
-        rotated[joint] = True
-        _turn_about(proposed, rotated, pose[parent], turn)
+        angle /= length
+        change = _change(bone, from_frame(_rotation((angle * x, angle * y, angle * z)), bone))
         if kind == HINGE:
-            vector[:] = proposed[joint] - pose[joint]
-            for k in range(len(pose)):
-                if body.below[joint, k] or body.below[other, k]:
-                    for i in range(3):
-                        proposed[k, i] = pose[k, i] + vector[i]
+            _shift(proposed, below, change)
+            _shift(proposed, body.below[other], change)
+        else:
+            for i in range(3):
+                proposed[joint, i] += change[i]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -157,61 +149,91 @@ def resample_placement(
         start += body.seed[root] / n_roots
     for i in range(3):
         new[i] = start[i] + body.root_noise / np.sqrt(n_roots) * rng.standard_normal()
-    turn = np.empty((3, 3))
-    _random_rotation(rng, turn)
+    turn = _random_rotation(rng)
     # The centre is drawn from its conditional; only relative root positions affect acceptance.
     before, after = 0.0, 0.0
     for root in body.roots:
+        x, y, z = pose[root] - middle
+        rotated = from_frame(turn, (x, y, z))
         for i in range(3):
-            rotated = 0.0
-            for m in range(3):
-                rotated += turn[i, m] * (pose[root, m] - middle[m])
             relative = body.seed[root, i] - start[i]
             before += (pose[root, i] - middle[i] - relative) ** 2
-            after += (rotated - relative) ** 2
+            after += (rotated[i] - relative) ** 2
     log_ratio = 0.5 * (before - after) / body.root_noise**2
     if -rng.standard_exponential() < log_ratio:
         parts[0] -= log_root_positions(pose, body)
-        _turn_about(pose, np.ones(len(pose), dtype=np.bool_), middle, turn)
+        x, y, z = middle
+        _turn_about(pose, np.ones(len(pose), dtype=np.bool_), (x, y, z), turn)
         pose += new - middle
         parts[0] += log_root_positions(pose, body)
 
 
-@numba.njit(cache=True, nogil=True)
-def _turn_about(pose: np.ndarray, chosen: np.ndarray, centre: np.ndarray, turn: np.ndarray) -> None:
+@numba.njit(**NO_ALLOCATION)
+def _position(pose: np.ndarray, joint: int) -> Vector:
+    return (pose[joint, 0], pose[joint, 1], pose[joint, 2])
+
+
+@numba.njit(**NO_ALLOCATION)
+def _middle(pose: np.ndarray, chosen: np.ndarray) -> Vector:
+    """Return the mean position of the chosen joints."""
+    n_joints, x, y, z = 0, 0.0, 0.0, 0.0
     for k in range(len(pose)):
         if chosen[k]:
-            x, y, z = pose[k, 0] - centre[0], pose[k, 1] - centre[1], pose[k, 2] - centre[2]
+            x, y, z = x + pose[k, 0], y + pose[k, 1], z + pose[k, 2]
+            n_joints += 1
+    return (x / n_joints, y / n_joints, z / n_joints)
+
+
+@numba.njit(**NO_ALLOCATION)
+def _change(old: Vector, new: Vector) -> Vector:
+    return (new[0] - old[0], new[1] - old[1], new[2] - old[2])
+
+
+@numba.njit(**NO_ALLOCATION)
+def _shift(pose: np.ndarray, chosen: np.ndarray, change: Vector) -> None:
+    for k in range(len(pose)):
+        if chosen[k]:
             for i in range(3):
-                pose[k, i] = centre[i] + turn[i, 0] * x + turn[i, 1] * y + turn[i, 2] * z
+                pose[k, i] += change[i]
 
 
-@numba.njit(cache=True, nogil=True)
-def _rotation(vector: np.ndarray, turn: np.ndarray) -> None:
-    """Write the matrix of a rotation vector."""
-    angle = np.sqrt((vector**2).sum())
+@numba.njit(**NO_ALLOCATION)
+def _turn_about(pose: np.ndarray, chosen: np.ndarray, centre: Vector, turn: Frame) -> None:
+    for k in range(len(pose)):
+        if chosen[k]:
+            turned = from_frame(turn, _change(centre, _position(pose, k)))
+            for i in range(3):
+                pose[k, i] = centre[i] + turned[i]
+
+
+@numba.njit(**NO_ALLOCATION)
+def _rotation(vector: Vector) -> Frame:
+    """Return the matrix of a rotation vector."""
+    angle = length_of(vector)
     half = 0.5 * angle
     scale = np.sin(half) / angle if angle > 1e-12 else 0.5
-    _write_rotation(np.cos(half), scale * vector[0], scale * vector[1], scale * vector[2], turn)
+    return _matrix(np.cos(half), scale * vector[0], scale * vector[1], scale * vector[2])
 
 
-@numba.njit(cache=True, nogil=True)
-def _random_rotation(rng: np.random.Generator, turn: np.ndarray) -> None:
+@numba.njit(**NO_ALLOCATION)
+def _random_rotation(rng: np.random.Generator) -> Frame:
     w, x = rng.standard_normal(), rng.standard_normal()
     y, z = rng.standard_normal(), rng.standard_normal()
     size = np.sqrt(w * w + x * x + y * y + z * z)
-    _write_rotation(w / size, x / size, y / size, z / size, turn)
+    return _matrix(w / size, x / size, y / size, z / size)
 
 
-@numba.njit(cache=True, nogil=True)
-def _write_rotation(w: float, x: float, y: float, z: float, R: np.ndarray) -> None:
-    # Row assignments would increase compile time by three seconds.
-    R[0, 0], R[0, 1], R[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    R[1, 0], R[1, 1], R[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    R[2, 0], R[2, 1], R[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+@numba.njit(**NO_ALLOCATION)
+def _matrix(w: float, x: float, y: float, z: float) -> Frame:
+    """Return the matrix of a unit quaternion."""
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+    )
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(**NO_ALLOCATION)
 def log_root_positions(pose: np.ndarray, body: Body) -> float:
     """Return the log density of the root positions, 0 at the seed."""
     total = 0.0

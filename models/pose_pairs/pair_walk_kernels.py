@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from probmotion.extras import numba
+from probmotion.extras import NO_ALLOCATION, numba
 from probmotion.interaction.geometry.graph_kernels import max_edges
 from probmotion.models.pose_pairs.annotation_moves import (
     approach,
@@ -13,15 +13,18 @@ from probmotion.models.pose_pairs.annotation_moves import (
     scaled_depths,
     transfer,
 )
+from probmotion.models.pose_pairs.joint_limits_frames import overwrite
 from probmotion.models.pose_pairs.pair_densities import (
     Physics,
     ViewAnnotations,
+    Workspace,
     log_annotations,
     log_measure,
     log_penetration,
     log_prior,
     log_surrogate,
     log_view,
+    workspace,
     write_limit_terms,
 )
 from probmotion.models.pose_pairs.pair_moves import (
@@ -71,6 +74,7 @@ def walk(
     """
     logs, new_logs = np.empty(views.near.shape[1]), np.empty(views.near.shape[1])
     new_pose, new_parts = np.empty_like(pose), np.empty_like(parts)
+    work = workspace(body, physics, max_edges(len(pose), views.prepared.graph))
     if power > 0:
         log_annotations(pose, view, body, views, logs)
     for done in range(0, n_steps, _SURROGATE_STEPS):
@@ -79,7 +83,7 @@ def walk(
         log_gain = _surrogate_walk(
             new_pose, new_parts, view, views.near[view, chosen], power,
             min(_SURROGATE_STEPS, n_steps - done), moves, sizes, tried, taken, body, physics,
-            views, rng,
+            views, work, rng,
         )  # fmt: skip
         if power > 0:
             log_annotations(new_pose, view, body, views, new_logs)
@@ -88,8 +92,8 @@ def walk(
                 pose[:], parts[:], logs[:] = new_pose, new_parts, new_logs
             for _ in range(_ANNOTATION_PROPOSALS):
                 _propose_transfer(
-                    pose, parts, logs, view, power, body, physics, views, new_pose, new_parts,
-                    new_logs, rng,
+                    pose, parts, logs, view, power, body, physics, views, work, new_pose,
+                    new_parts, new_logs, rng,
                 )  # fmt: skip
         else:
             pose[:], parts[:] = new_pose, new_parts
@@ -118,6 +122,7 @@ def _propose_transfer(
     body: Body,
     physics: Physics,
     views: ViewAnnotations,
+    work: Workspace,
     new_pose: np.ndarray,
     new_parts: np.ndarray,
     new_logs: np.ndarray,
@@ -133,14 +138,15 @@ def _propose_transfer(
         return
     depths = scaled_depths(pose, view, body, views)
     sides = draw_sides(depths, rng)
-    log_volume = transfer(pose, sides, view, near[old], near[new], body, views, new_pose)
+    log_volume = transfer(
+        pose, sides, view, near[old], near[new], body, views, work.image, new_pose
+    )
     if log_volume == -np.inf:
         return
     log_sides = log_side_probability(sides, scaled_depths(new_pose, view, body, views))
     log_sides -= log_side_probability(sides, depths)
-    errors, terms = np.empty((2, len(pose))), np.empty(max_edges(len(pose), views.prepared.graph))
-    log_gain = log_surrogate(new_pose, view, near[new], body, views, errors, terms)
-    log_gain -= log_surrogate(pose, view, near[old], body, views, errors, terms)
+    log_gain = log_surrogate(new_pose, view, near[new], body, views, work)
+    log_gain -= log_surrogate(pose, view, near[old], body, views, work)
     new_parts[:] = parts
     new_parts[0], new_parts[1] = log_measure(new_pose, body), 0.0
     log_ratio = log_volume + log_sides + power * log_gain + new_parts[0] - parts[0]
@@ -148,10 +154,10 @@ def _propose_transfer(
         return
     lower_bound = log_prior(parts, physics) - parts[0] - rng.standard_exponential()
     for person in range(len(body.roots)):
-        write_limit_terms(new_pose, person, physics, new_parts)
+        write_limit_terms(new_pose, person, physics, new_parts, work)
     if not log_prior(new_parts, physics) - new_parts[0] >= lower_bound:
         return
-    new_parts[1] = log_penetration(new_pose, physics)
+    new_parts[1] = log_penetration(new_pose, physics, work)
     if not log_prior(new_parts, physics) - new_parts[0] >= lower_bound:
         return
     log_annotations(new_pose, view, body, views, new_logs)
@@ -160,7 +166,7 @@ def _propose_transfer(
         pose[:], parts[:], logs[:] = new_pose, new_parts, new_logs
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(**NO_ALLOCATION)
 def _surrogate_walk(
     pose: np.ndarray,
     parts: np.ndarray,
@@ -175,15 +181,15 @@ def _surrogate_walk(
     body: Body,
     physics: Physics,
     views: ViewAnnotations,
+    work: Workspace,
     rng: np.random.Generator,
 ) -> float:
     """Take Metropolis steps on prior · surrogate^power; return the change of the log surrogate.
 
     At power 0, the annotation only serves the moves.
     """
-    proposed, new_parts = np.empty_like(pose), np.empty_like(parts)
-    errors, terms = np.empty((2, len(pose))), np.empty(max_edges(len(pose), views.prepared.graph))
-    start = log_surrogate(pose, view, annotation, body, views, errors, terms) if power > 0 else 0.0
+    proposed, new_parts = work.pose, work.parts
+    start = log_surrogate(pose, view, annotation, body, views, work) if power > 0 else 0.0
     current = start
     for _ in range(n_steps):
         number = int(rng.random() * len(moves))
@@ -192,17 +198,19 @@ def _surrogate_walk(
         log_volume = 0.0
         if kind == APPROACH:
             ratio = np.exp(sizes[number] * rng.standard_normal())
-            log_volume = approach(pose, joint, ratio, view, annotation, body, views, proposed)
+            log_volume = approach(
+                pose, joint, ratio, view, annotation, body, views, work.image, proposed
+            )
             if log_volume == -np.inf:
                 continue
         else:
             propose(pose, moves[number], sizes[number], body, rng, proposed)
-        new_parts[:] = parts
+        overwrite(new_parts, parts)
         # Delayed acceptance: evaluate cheap terms first (Christen and Fox 2005).
         new_parts[0] = log_measure(proposed, body)
         new = 0.0
         if power > 0:
-            new = log_surrogate(proposed, view, annotation, body, views, errors, terms)
+            new = log_surrogate(proposed, view, annotation, body, views, work)
         log_ratio = new_parts[0] - parts[0] + power * (new - current) + log_volume
         if not -rng.standard_exponential() < log_ratio:
             continue
@@ -210,17 +218,19 @@ def _surrogate_walk(
         new_parts[1] = 0.0
         if kind == APPROACH and joint < 0:
             for person in range(len(body.roots)):
-                write_limit_terms(proposed, person, physics, new_parts)
+                write_limit_terms(proposed, person, physics, new_parts, work)
         elif kind != TURN and kind != SHIFT:
-            write_limit_terms(proposed, body.person[joint], physics, new_parts)
+            write_limit_terms(proposed, body.person[joint], physics, new_parts, work)
         # Penetration only decreases the density, so joint limits, which reject more often, may
         # suffice to reject.
         if not log_prior(new_parts, physics) - new_parts[0] >= lower_bound:
             continue
-        new_parts[1] = log_penetration(proposed, physics)
+        new_parts[1] = log_penetration(proposed, physics, work)
         if not log_prior(new_parts, physics) - new_parts[0] >= lower_bound:
             continue
-        pose[:], parts[:], current = proposed, new_parts, new
+        overwrite(pose, proposed)
+        overwrite(parts, new_parts)
+        current = new
         taken[number] += 1
     return current - start
 

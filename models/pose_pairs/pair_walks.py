@@ -19,6 +19,7 @@ from probmotion.models.pose_pairs.pair_densities import (
     log_prior_terms,
     log_view,
     log_views,
+    workspace,
 )
 from probmotion.models.pose_pairs.pair_moves import Body, moves_of
 from probmotion.models.pose_pairs.pair_walk_kernels import walk
@@ -75,7 +76,8 @@ class PairWalks:
     def terms(self, pose: np.ndarray) -> np.ndarray:
         """Return the terms of the log prior of a pose (J, 3), which :meth:`walk` updates."""
         parts = np.empty(2 + 2 * len(self.body.roots))
-        log_prior_terms(pose, self.body, self.physics, parts)
+        work = workspace(self.body, self.physics, 0)
+        log_prior_terms(pose, self.body, self.physics, parts, work)
         return parts
 
     def log_view(self, pose: np.ndarray, view: int) -> float:

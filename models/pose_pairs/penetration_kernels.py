@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from probmotion.extras import numba
+from probmotion.extras import NO_ALLOCATION, numba
 
-__all__ = ["capsule_depth", "segment_distance", "total_depths"]
+__all__ = ["capsule_depth", "segment_distance", "total_depth", "total_depths"]
 
 _TINY = 1e-18  # squared length below which a segment counts as a point, m²
 
@@ -16,7 +16,7 @@ def _within(x: float) -> float:
     return min(1.0, max(0.0, x))
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def segment_distance(p: np.ndarray, q: np.ndarray, r: np.ndarray, s: np.ndarray) -> float:
     """Return the distance between the segments p–q and r–s, metres; their length may be 0.
 
@@ -51,7 +51,7 @@ def segment_distance(p: np.ndarray, q: np.ndarray, r: np.ndarray, s: np.ndarray)
     return np.sqrt(square)
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def capsule_depth(
     pose: np.ndarray, bones: np.ndarray, radii: np.ndarray, first: int, second: int
 ) -> float:
@@ -61,27 +61,38 @@ def capsule_depth(
     return max(0.0, radii[first] + radii[second] - segment_distance(p, q, r, s))
 
 
+@numba.njit(**NO_ALLOCATION)
+def total_depth(
+    pose: np.ndarray, bones: np.ndarray, radii: np.ndarray, pairs: np.ndarray, spheres: np.ndarray
+) -> float:
+    """Return the total depth ρ of a pose; skip pairs with disjoint bounding spheres.
+
+    ``spheres`` (bones, 4) is a workspace array for their centres and radii.
+    """
+    for bone in range(len(bones)):
+        square = 0.0
+        for i in range(3):
+            end, start = pose[bones[bone, 0], i], pose[bones[bone, 1], i]
+            spheres[bone, i] = 0.5 * (end + start)
+            square += (end - start) ** 2
+        spheres[bone, 3] = 0.5 * np.sqrt(square) + radii[bone]
+    total = 0.0
+    for k in range(len(pairs)):
+        first, second = pairs[k, 0], pairs[k, 1]
+        square = 0.0
+        for i in range(3):
+            square += (spheres[first, i] - spheres[second, i]) ** 2
+        if square < (spheres[first, 3] + spheres[second, 3]) ** 2:
+            total += capsule_depth(pose, bones, radii, first, second)
+    return total
+
+
 @numba.njit(cache=True)
 def total_depths(
     poses: np.ndarray, bones: np.ndarray, radii: np.ndarray, pairs: np.ndarray
 ) -> np.ndarray:
-    """Return the total depth ρ of each pose, (n,); skip pairs with disjoint bounding spheres."""
-    total = np.zeros(len(poses))
-    middles, reach = np.empty((len(bones), 3)), np.empty(len(bones))
+    """Return the :func:`total_depth` of each pose, (n,)."""
+    total, spheres = np.empty(len(poses)), np.empty((len(bones), 4))
     for n in range(len(poses)):
-        pose = poses[n]
-        for bone in range(len(bones)):
-            square = 0.0
-            for i in range(3):
-                end, start = pose[bones[bone, 0], i], pose[bones[bone, 1], i]
-                middles[bone, i] = 0.5 * (end + start)
-                square += (end - start) ** 2
-            reach[bone] = 0.5 * np.sqrt(square) + radii[bone]
-        for k in range(len(pairs)):
-            first, second = pairs[k, 0], pairs[k, 1]
-            square = 0.0
-            for i in range(3):
-                square += (middles[first, i] - middles[second, i]) ** 2
-            if square < (reach[first] + reach[second]) ** 2:
-                total[n] += capsule_depth(pose, bones, radii, first, second)
+        total[n] = total_depth(poses[n], bones, radii, pairs, spheres)
     return total

@@ -9,6 +9,7 @@ from probmotion.models.pose_pairs.pair_densities import (
     Physics,
     log_lengths,
     log_penetration,
+    workspace,
     write_limit_terms,
 )
 from probmotion.models.pose_pairs.pair_moves import SHIFT, TURN, Body, propose
@@ -86,16 +87,16 @@ def _walk(
     negative.
     """
     people = len(body.roots)
-    parts, new_parts = np.zeros(2 + 2 * people), np.empty(2 + 2 * people)
-    proposed = np.empty_like(pose)
+    work = workspace(body, physics, 0)
+    parts, proposed, new_parts = np.zeros(2 + 2 * people), work.pose, work.parts
     white, new_white = np.empty(roots.shape[2]), np.empty(roots.shape[2])
     component = _draw_component(pose, log_weights, means, cells, roots, white, rng)
     root = roots[cells[component]]
     _whiten(pose, means[component], root, white)
     parts[0] = -0.5 * (white @ white) + _log_bones(pose, body, power)
-    parts[1] = log_penetration(pose, physics)
+    parts[1] = log_penetration(pose, physics, work)
     for person in range(people):
-        write_limit_terms(pose, person, physics, parts)
+        write_limit_terms(pose, person, physics, parts, work)
     for step in range(_STEPS):
         number = int(rng.random() * len(moves))
         kind, joint = moves[number, 0], moves[number, 1]
@@ -110,10 +111,10 @@ def _walk(
         accepted = -rng.standard_exponential() < new_parts[0] - parts[0]
         if accepted:
             if kind != TURN and kind != SHIFT:
-                write_limit_terms(proposed, body.person[joint], physics, new_parts)
+                write_limit_terms(proposed, body.person[joint], physics, new_parts, work)
             accepted = new_parts[2 + people :].sum() <= physics.max_invalid
         if accepted:
-            new_parts[1] = log_penetration(proposed, physics)
+            new_parts[1] = log_penetration(proposed, physics, work)
             gain = new_parts[1 : 2 + people].sum() - parts[1 : 2 + people].sum()
             accepted = -rng.standard_exponential() < gain
         if accepted:

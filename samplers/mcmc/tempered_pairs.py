@@ -47,6 +47,8 @@ __all__ = ["TemperedPairs"]
 _TARGET_ACCEPTANCE = 0.3  # Target acceptance rate of the moves.
 _INITIAL_SIZE = 0.1  # Initial step size of every move.
 _MAX_SIZE = math.e  # Maximum step size.
+_LOW_POWER = 0.03  # Power below which views change so often that fewer steps suffice.
+_LOW_STEPS = 40  # Maximum number of steps per level of a low power.
 _INITIAL_ROUND = 16  # Number of exchanges before the powers are first tuned.
 _MIN_POWER = 1e-5  # Smallest positive power before tuning.
 _STATE = (  # Stored attributes of a chain, and those of the truncated state.
@@ -65,7 +67,7 @@ class TemperedPairs:
     levels : int
         Number of powers from 0 to 1.
     steps : int
-        Number of Metropolis steps per level between exchanges.
+        Number of Metropolis steps per level between exchanges; at most 40 of powers below 0.03.
     warmup : int
         Number of exchanges before the first draw, used to tune powers and step sizes.
     thin : int
@@ -301,20 +303,21 @@ class _Ladder:
     def _exchange_after_walking(self, stop: Event) -> None:
         if stop.is_set():
             raise KeyboardInterrupt
-        sizes = np.exp(self.log_sizes)
+        sizes, steps = np.exp(self.log_sizes), np.full(len(self.powers), self.sampler.steps)
+        steps[self.powers < _LOW_POWER] = min(self.sampler.steps, _LOW_STEPS)
         for level, power in enumerate(self.powers):
             self.views[level], self.seen[level] = self.walks.walk(
                 self.poses[level],
                 self.parts[level],
                 self.views[level],
                 power,
-                self.sampler.steps,
+                steps[level],
                 sizes[level],
                 self.tried[level],
                 self.taken[level],
                 self.rng,
             )
-        self.evaluations += self.sampler.steps * len(self.poses)
+        self.evaluations += int(steps.sum())
         if self.cut is not None:
             self.cut.exchange(self)
         log_ratio = np.diff(self.powers) * (self.seen[:-1] - self.seen[1:])

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from probmotion.extras import numba
+from probmotion.extras import NO_ALLOCATION, numba
 from probmotion.interaction.geometry.graph_kernels import max_edges, write_graph
 from probmotion.interaction.geometry.plane_contexts import context_cost, polar_bins
 
@@ -139,7 +139,7 @@ def distances_to(
         distances[position] = distance
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def annotation_graph_distance(
     joints: np.ndarray, k: int, prepared: Prepared, difference: np.ndarray, terms: np.ndarray
 ) -> float:
@@ -188,7 +188,7 @@ def prepare_projection(points: np.ndarray, prepared: Prepared) -> Projection:
     return Projection(joints, edges, weights, n_edges, bins)
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def rotation(source: np.ndarray, target: np.ndarray) -> tuple[float, float, float]:
     """Return the cosine and sine of the least-squares rotation and Σ target · (rotated source).
 
@@ -230,7 +230,7 @@ def _distance(
     return total + _annotation_sum(difference, k, prepared, terms)
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def residual(
     joints: np.ndarray, target: np.ndarray, cosine: float, sine: float, difference: np.ndarray
 ) -> None:
@@ -241,7 +241,7 @@ def residual(
         difference[1, joint] = sine * x + cosine * y - target[1, joint]
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def _annotation_sum(difference: np.ndarray, k: int, prepared: Prepared, terms: np.ndarray) -> float:
     """Return the second sum of eq. 8, over the annotation's graph."""
     start, stop = prepared.edge_start[k], prepared.edge_start[k + 1]
@@ -277,7 +277,7 @@ def projection_sum(
     return total / weight if weight > 0 else np.inf
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def _sum(terms: np.ndarray, n_terms: int) -> float:
     """Return the sum of the terms; four accumulators allow instruction-level parallelism."""
     a, b, c, d = 0.0, 0.0, 0.0, 0.0

@@ -20,6 +20,7 @@ from probmotion.models.pose_pairs.pair_densities import (
     log_surrogate,
     log_views,
     project_to_view,
+    workspace,
 )
 from probmotion.models.pose_pairs.pair_moves import APPROACH, HINGE, STRETCH, moves_of, propose
 from probmotion.models.pose_pairs.pair_walk_kernels import walk
@@ -49,18 +50,19 @@ def exact(prior):
 
 def pair_arrays(posterior):
     walks = posterior.prior.walks(posterior.likelihood)
-    return walks.body, walks.physics, walks.views
+    body, physics = walks.body, walks.physics
+    return body, physics, walks.views, workspace(body, physics, 200)
 
 
 def test_compiled_density_matches_the_posterior(prior, likelihood):
     posterior = MotionPosterior(prior, replace(likelihood, noise=0.01))
-    body, physics, views = pair_arrays(posterior)
+    body, physics, views, work = pair_arrays(posterior)
     rng = np.random.default_rng(0)
     theta = rng.uniform(0.05, 0.6, (40, 1)) * rng.standard_normal((40, prior.dim))
     poses = np.ascontiguousarray(prior.motion(theta)[:, 0])
     parts, logs = np.zeros(6), []
     for pose in poses:
-        log_prior_terms(pose, body, physics, parts)
+        log_prior_terms(pose, body, physics, parts, work)
         logs.append(log_prior(parts, physics) + logsumexp(log_views(pose, body, views)))
     stretches, translations = theta[:, 12:].reshape(40, -1, 3)[..., 2], theta[:, 6:12]
     normal = -0.5 * ((stretches / 0.05) ** 2).sum(axis=-1) - 0.5 * (translations**2).sum(axis=-1)
@@ -75,10 +77,10 @@ def test_compiled_density_matches_the_posterior(prior, likelihood):
 def test_surrogate_matches_an_explicit_distance(prior, likelihood, measure):
     """The reference uses complex numbers; without a graph, the surrogate is exact."""
     likelihood = replace(likelihood, measure=measure)
-    body, _, views = pair_arrays(MotionPosterior(prior, likelihood))
+    body, _, views, work = pair_arrays(MotionPosterior(prior, likelihood))
     prepared, view, rng = views.prepared, 3, np.random.default_rng(0)
     pose = prior.seed[0] + 0.1 * rng.standard_normal(prior.seed[0].shape)
-    diffs, terms, logs = np.empty((2, len(pose))), np.empty(200), np.empty(views.near.shape[1])
+    logs = np.empty(views.near.shape[1])
     log_annotations(pose, view, body, views, logs)
     points = project_to_view(pose, view, body, views) @ [1, 1j]
     points -= points.mean()
@@ -86,7 +88,7 @@ def test_surrogate_matches_an_explicit_distance(prior, likelihood, measure):
         target = prepared.joints[annotation].T @ [1, 1j]
         product = np.vdot(points, target)
         error = points * product / abs(product) - target
-        surrogate = log_surrogate(pose, view, annotation, body, views, diffs, terms)
+        surrogate = log_surrogate(pose, view, annotation, body, views, work)
         if measure == "cartesian":
             distance = math.sqrt(np.mean(np.abs(error) ** 2))
             assert exact == pytest.approx(surrogate, rel=1e-9)
@@ -99,7 +101,7 @@ def test_surrogate_matches_an_explicit_distance(prior, likelihood, measure):
 
 def test_moves_preserve_bone_lengths(prior, likelihood):
     """Only stretches change bone lengths; hinges also preserve the distance between joints."""
-    body, _, _ = pair_arrays(MotionPosterior(prior, likelihood))
+    body, *_ = pair_arrays(MotionPosterior(prior, likelihood))
     pose, rng = prior.seed[0], np.random.default_rng(0)
     ends, starts = np.array(prior.skeleton.bones).T
     before = np.linalg.norm(pose[ends] - pose[starts], axis=1)
@@ -122,18 +124,18 @@ def test_moves_preserve_bone_lengths(prior, likelihood):
 @pytest.mark.parametrize("person", [-1, 0, 1])
 def test_an_approach_is_inverted_by_its_inverse(prior, likelihood, person):
     """Angles to the annotation's bones are scaled; the frame and bone lengths stay."""
-    body, _, views = pair_arrays(MotionPosterior(prior, likelihood))
+    body, _, views, work = pair_arrays(MotionPosterior(prior, likelihood))
     rng, done = np.random.default_rng(0), 0
     root = -1 if person < 0 else int(body.roots[person])
     for number in range(60):
         view, annotation = number % 5, views.near[number % 5, number % 4]
         pose = prior.seed[0] + 0.02 * rng.standard_normal(prior.seed[0].shape)
         new, back = np.empty_like(pose), np.empty_like(pose)
-        log_volume = approach(pose, root, 0.8, view, annotation, body, views, new)
+        log_volume = approach(pose, root, 0.8, view, annotation, body, views, work.image, new)
         if log_volume == -np.inf:
             continue
         done += 1
-        inverse = approach(new, root, 1 / 0.8, view, annotation, body, views, back)
+        inverse = approach(new, root, 1 / 0.8, view, annotation, body, views, work.image, back)
         assert inverse == pytest.approx(-log_volume, rel=1e-6)
         np.testing.assert_allclose(back, pose, atol=1e-9)
         axes = image_axes(pose, view, body, views)
@@ -149,10 +151,10 @@ def test_an_approach_is_inverted_by_its_inverse(prior, likelihood, person):
 
 def test_the_volume_of_an_approach_is_that_of_solid_angles(prior, likelihood):
     """The area of a small triangle of directions of each bone changes by a known factor."""
-    body, _, views = pair_arrays(MotionPosterior(prior, likelihood))
+    body, _, views, work = pair_arrays(MotionPosterior(prior, likelihood))
     pose, view = prior.seed[0], 1
     annotation, new = views.near[view, 0], np.empty_like(pose)
-    total = approach(pose, -1, 1.1, view, annotation, body, views, new)
+    total = approach(pose, -1, 1.1, view, annotation, body, views, work.image, new)
     assert np.isfinite(total)
     factors, size = [], 1e-5
     for joint in np.flatnonzero(~body.framing):
@@ -165,7 +167,7 @@ def test_the_volume_of_an_approach_is_that_of_solid_angles(prior, likelihood):
             turned = bone + size * np.linalg.norm(bone) * side
             turned *= np.linalg.norm(bone) / np.linalg.norm(turned)
             moved = pose + np.where(body.below[joint], 1, 0)[:, None] * (turned - bone)
-            approach(moved, -1, 1.1, view, annotation, body, views, new)
+            approach(moved, -1, 1.1, view, annotation, body, views, work.image, new)
             mapped.append((new[joint] - new[body.parents[joint]]) / np.linalg.norm(bone))
         area = np.linalg.norm(np.cross(mapped[1] - mapped[0], mapped[2] - mapped[0]))
         factors.append(math.log(area / size**2))
@@ -174,7 +176,7 @@ def test_the_volume_of_an_approach_is_that_of_solid_angles(prior, likelihood):
 
 def test_a_transfer_is_inverted_by_its_inverse(prior, likelihood):
     """Frame and bone lengths stay; the roots' distance and its volume are scaled."""
-    body, _, views = pair_arrays(MotionPosterior(prior, likelihood))
+    body, _, views, work = pair_arrays(MotionPosterior(prior, likelihood))
     rng, (first, second) = np.random.default_rng(0), body.roots
     ends, starts = np.array(prior.skeleton.bones).T
     for view in range(5):
@@ -182,8 +184,8 @@ def test_a_transfer_is_inverted_by_its_inverse(prior, likelihood):
         pose = prior.seed[0] + 0.02 * rng.standard_normal(prior.seed[0].shape)
         sides = rng.choice([-1.0, 1.0], size=len(pose))
         new, back = np.empty_like(pose), np.empty_like(pose)
-        log_volume = transfer(pose, sides, view, start, end, body, views, new)
-        inverse = transfer(new, sides, view, end, start, body, views, back)
+        log_volume = transfer(pose, sides, view, start, end, body, views, work.image, new)
+        inverse = transfer(new, sides, view, end, start, body, views, work.image, back)
         assert inverse == pytest.approx(-log_volume, rel=1e-9)
         np.testing.assert_allclose(back, pose, atol=1e-9)
         axes = image_axes(pose, view, body, views)
@@ -199,16 +201,17 @@ def test_a_transfer_is_inverted_by_its_inverse(prior, likelihood):
 
 def test_a_transfer_needs_roots_apart(prior, likelihood):
     """If roots of an annotation coincide, no distance can be scaled, and the walk goes on."""
-    body, physics, views = pair_arrays(MotionPosterior(prior, likelihood))
+    body, physics, views, work = pair_arrays(MotionPosterior(prior, likelihood))
     pose, new, parts = prior.seed[0].copy(), np.empty_like(prior.seed[0]), np.zeros(6)
     joints = views.prepared.joints.copy()
     start, end = views.near[0, :2]
     joints[end, :, body.roots[1]] = joints[end, :, body.roots[0]]
     together = views._replace(prepared=views.prepared._replace(joints=joints))
     for pair in ((start, end), (end, start)):
-        assert transfer(pose, np.ones(len(pose)), 0, *pair, body, together, new) == -np.inf
+        arguments = (body, together, work.image, new)
+        assert transfer(pose, np.ones(len(pose)), 0, *pair, *arguments) == -np.inf
     moves, rng = moves_of(body), np.random.default_rng(0)
-    log_prior_terms(pose, body, physics, parts)
+    log_prior_terms(pose, body, physics, parts, work)
     counters = (moves, np.full(len(moves), 0.1), np.zeros(len(moves)), np.zeros(len(moves)))
     walk(pose, parts, 0, 0.1, 2000, *counters, body, physics, together, rng)
     assert np.isfinite(pose).all()
@@ -216,19 +219,19 @@ def test_a_transfer_needs_roots_apart(prior, likelihood):
 
 def test_a_transfer_leads_from_one_annotation_to_the_other(prior, likelihood):
     """A pose whose bones lie on the first annotation's comes to lie on the second's."""
-    body, _, views = pair_arrays(MotionPosterior(prior, likelihood))
+    body, _, views, work = pair_arrays(MotionPosterior(prior, likelihood))
     rng, done = np.random.default_rng(0), 0
     for number in range(30):
         view, start, end = number % 5, *views.near[number % 5, :2]
         pose = prior.seed[0] + 0.02 * rng.standard_normal(prior.seed[0].shape)
         near, new, nearer = (np.empty_like(pose) for _ in range(3))
-        if approach(pose, -1, 1e-4, view, start, body, views, near) == -np.inf:
+        if approach(pose, -1, 1e-4, view, start, body, views, work.image, near) == -np.inf:
             continue
         towards = image_axes(pose, view, body, views)[2]
         sides = np.sign((near - near[body.parents]) @ np.array(towards))
         assert (sides * scaled_depths(near, view, body, views) >= 0).all()
-        transfer(near, sides, view, start, end, body, views, new)
-        if approach(new, -1, 0.5, view, end, body, views, nearer) == -np.inf:
+        transfer(near, sides, view, start, end, body, views, work.image, new)
+        if approach(new, -1, 0.5, view, end, body, views, work.image, nearer) == -np.inf:
             continue
         done += 1
         np.testing.assert_allclose(nearer, new, atol=1e-3)
@@ -249,16 +252,16 @@ def test_ratio_of_annotations_has_their_probabilities():
 
 def test_walk_updates_its_terms_correctly(prior, likelihood):
     """Incrementally updated terms equal recomputed ones."""
-    body, physics, views = pair_arrays(MotionPosterior(prior, likelihood))
+    body, physics, views, work = pair_arrays(MotionPosterior(prior, likelihood))
     rng = np.random.default_rng(0)
     pose, parts, moves = prior.seed[0].copy(), np.zeros(6), moves_of(body)
-    log_prior_terms(pose, body, physics, parts)
+    log_prior_terms(pose, body, physics, parts, work)
     sizes, trials, accepted = np.full(len(moves), 0.1), np.zeros(len(moves)), np.zeros(len(moves))
     counters = (moves, sizes, trials, accepted)
     view, log_l = walk(pose, parts, 2, 1.0, 4000, *counters, body, physics, views, rng)
     assert log_l == pytest.approx(log_views(pose, body, views)[view], rel=1e-9)
     expected = np.zeros(6)
-    log_prior_terms(pose, body, physics, expected)
+    log_prior_terms(pose, body, physics, expected, work)
     np.testing.assert_allclose(parts, expected, rtol=1e-9, atol=1e-9)
     assert (accepted[trials > 0] > 0).mean() > 0.9
     assert expected[4:].sum() <= prior.max_invalid
@@ -272,7 +275,7 @@ def test_walk_samples_the_tempered_density(prior, likelihood, exact):
     """
     weak_prior, power = replace(prior, position_noise=0.7, max_invalid=24), 0.6
     posterior = MotionPosterior(weak_prior, replace(likelihood, n_near=30, noise=0.3))
-    body, physics, views = pair_arrays(posterior)
+    body, physics, views, work = pair_arrays(posterior)
 
     def summary(poses: np.ndarray):
         """Return log L_v, the number of equally near annotations and log L_v − mean, (n, V, 3)."""
@@ -295,7 +298,7 @@ def test_walk_samples_the_tempered_density(prior, likelihood, exact):
     counters = (moves, np.full(len(moves), 0.7), np.zeros(len(moves)), np.zeros(len(moves)))
     for chain in range(2):
         rng, pose, parts, view = np.random.default_rng(chain), prior.seed[0].copy(), np.zeros(6), 0
-        log_prior_terms(pose, body, physics, parts)
+        log_prior_terms(pose, body, physics, parts, work)
         states = []
         for _ in range(1100):
             view, _ = walk(pose, parts, view, power, 400, *counters, body, physics, views, rng)
@@ -314,12 +317,12 @@ def test_transfers_preserve_the_tempered_density(prior, likelihood, exact, noise
     """
     weak_prior, power = replace(prior, position_noise=0.7, max_invalid=24), 0.6
     posterior = MotionPosterior(weak_prior, replace(likelihood, n_near=8, noise=noise))
-    body, physics, views = pair_arrays(posterior)
+    body, physics, views, work = pair_arrays(posterior)
     rng, (n_views, n_near), n = np.random.default_rng(0), views.near.shape, len(exact)
     log_weight = weak_prior.log_plausibility(exact[:, None])
     summaries, poses = np.empty((2, n, 4)), exact.copy()
     parts, logs = np.empty(6), np.empty(n_near)
-    workspace = (np.empty_like(poses[0]), np.empty(6), np.empty(n_near))
+    arrays = (work, np.empty_like(poses[0]), np.empty(6), np.empty(n_near))
 
     def summary(pose: np.ndarray, view: int, logs: np.ndarray) -> list[float]:
         """Return log L_v, distance of roots, bones near the image plane and annotations in use."""
@@ -331,13 +334,13 @@ def test_transfers_preserve_the_tempered_density(prior, likelihood, exact, noise
 
     for k, pose in enumerate(poses):
         view = int(rng.integers(n_views))
-        log_prior_terms(pose, body, physics, parts)
+        log_prior_terms(pose, body, physics, parts, work)
         log_annotations(pose, view, body, views, logs)
         log_weight[k] += power * logs.max()
         summaries[0, k] = summary(pose, view, logs)
         for _ in range(20):
             pair_walk_kernels._propose_transfer(
-                pose, parts, logs, view, power, body, physics, views, *workspace, rng
+                pose, parts, logs, view, power, body, physics, views, *arrays, rng
             )
         summaries[1, k] = summary(pose, view, logs)
     weight = np.exp(log_weight - log_weight.max())
