@@ -73,6 +73,13 @@ def test_draws_match_importance_sampling(prior, likelihood, exact, limit):
         assert (drawn[..., :2].sum(axis=-1) >= posterior.log_floor - 1e-6).all()
 
 
+def test_levels_of_low_powers_take_fewer_steps(prior, likelihood):
+    """Powers are 0, 10⁻⁵ and 1 for 16 exchanges; then tuning increases the second."""
+    sampler = TemperedPairs(levels=3, steps=100, warmup=16, thin=1)
+    run = sampler.sample(MotionPosterior(prior, likelihood), draws=1, progress=False)
+    assert run.counts["density"] - 16 * (40 + 40 + 100) in (40 + 40 + 100, 40 + 100 + 100)
+
+
 def test_error_of_one_chain_stops_all_chains(prior, likelihood, monkeypatch):
     exchange, ladders = tempered_pairs._Ladder._exchange_after_walking, {}
 
