@@ -41,8 +41,9 @@ OPTIONAL = {
 """Extra of this package that installs a library, by the name to import from this module."""
 
 NO_ALLOCATION = {"cache": True, "nogil": True, "_nrt": False}
-"""Options of ``numba.njit`` for functions that create no arrays. Without them, functions count
-references to each array of their arguments, which takes most of the time of short functions."""
+"""Options of ``numba.njit`` for functions that create no arrays and are called by compiled code.
+Without them, functions count references to each array of their arguments, which takes most of the
+time of short functions. Functions that these call inherit the private option ``_nrt``."""
 
 _MODULES = {"nn": "torch.nn"}  # if other than the name
 

@@ -1,4 +1,4 @@
-"""Compiled geometry of joint limits: frames, minimal rotations and cells of the sphere.
+"""Compiled geometry of poses: vectors, frames, minimal rotations and cells of the sphere.
 
 Vectors are tuples, and matrices are tuples of columns; Numba compiles both to registers.
 """
@@ -12,7 +12,7 @@ from probmotion.extras import NO_ALLOCATION, numba
 __all__ = [
     "NO_LENGTH", "Frame", "Vector", "between", "cell_of", "closeness_of", "cross", "dot",
     "from_frame", "in_frame", "least_rotation", "length_of", "line_frame", "overwrite", "product",
-    "unit",
+    "row_of", "unit",
 ]  # fmt: skip
 
 Vector = tuple[float, float, float]
@@ -106,6 +106,12 @@ def overwrite(target: np.ndarray, source: np.ndarray) -> None:
     """Copy an array; the assignment of a slice would allocate a buffer."""
     for i in range(source.size):
         target.flat[i] = source.flat[i]
+
+
+@numba.njit(**NO_ALLOCATION)
+def row_of(rows: np.ndarray, number: int) -> Vector:
+    """Return a row of an array (n, 3)."""
+    return (rows[number, 0], rows[number, 1], rows[number, 2])
 
 
 @numba.njit(**NO_ALLOCATION)

@@ -17,6 +17,7 @@ from probmotion.models.pose_pairs.joint_limits_frames import (
     Vector,
     between,
     cell_of,
+    dot,
     from_frame,
     in_frame,
     least_rotation,
@@ -24,6 +25,7 @@ from probmotion.models.pose_pairs.joint_limits_frames import (
     line_frame,
     overwrite,
     product,
+    row_of,
     unit,
 )  # fmt: skip
 from probmotion.motion.skeleton import Skeleton
@@ -78,11 +80,6 @@ class Walk(NamedTuple):
 
 
 @numba.njit(**NO_ALLOCATION)
-def _row(rows: np.ndarray, number: int) -> Vector:
-    return (rows[number, 0], rows[number, 1], rows[number, 2])
-
-
-@numba.njit(**NO_ALLOCATION)
 def _set_row(rows: np.ndarray, number: int, v: Vector) -> None:
     rows[number, 0], rows[number, 1], rows[number, 2] = v
 
@@ -102,13 +99,13 @@ def _side_frame(frame: Frame, side: int) -> Frame:
 @numba.njit(**NO_ALLOCATION)
 def _rotate_bone(directions: np.ndarray, joint: int, new: Vector, last: int) -> None:
     """Set the direction of a bone and rotate its descendants, up to joint ``last``."""
-    old = _row(directions, joint)
+    old = row_of(directions, joint)
     _set_row(directions, joint, new)
     if old == NO_LENGTH:
         return
     turn = least_rotation(old, new)
     for below in range(joint + 1, last + 1):
-        _set_row(directions, below, unit(from_frame(turn, _row(directions, below))))
+        _set_row(directions, below, unit(from_frame(turn, row_of(directions, below))))
 
 
 @numba.njit(**NO_ALLOCATION)
@@ -117,17 +114,16 @@ def _nearest_allowed(u: Vector, part: int, row: int, limits: LimitArrays) -> Vec
     best, closest = 0, -2.0
     for cell in range(len(limits.centres)):
         if limits.allowed[part, row, cell]:
-            x, y, z = _row(limits.centres, cell)
-            c = u[0] * x + u[1] * y + u[2] * z
+            c = dot(u, row_of(limits.centres, cell))
             if c > closest:
                 best, closest = cell, c
-    centre = _row(limits.centres, best)
+    centre = row_of(limits.centres, best)
     outside, inside = 0.0, 1.0
     for _ in range(_BISECTIONS):
         middle = 0.5 * (outside + inside)
-        between = _interpolated(u, centre, middle)
-        cell = cell_of(between, limits.cell_rings)
-        if between != NO_LENGTH and limits.allowed[part, row, cell]:
+        direction = _interpolated(u, centre, middle)
+        cell = cell_of(direction, limits.cell_rings)
+        if direction != NO_LENGTH and limits.allowed[part, row, cell]:
             inside = middle
         else:
             outside = middle
@@ -153,10 +149,10 @@ def _check(part: int, joint: int, last: int, frame: Frame, condition: Vector, wa
     A bone of length 0 is valid and gets its mean direction.
     """
     limits, correct, (_, directions, valid, local, _) = walk
-    direction = _row(directions, joint)
+    direction = row_of(directions, joint)
     valid[joint] = True
     if direction == NO_LENGTH:
-        u = _row(limits.rest, part)
+        u = row_of(limits.rest, part)
         _rotate_bone(directions, joint, from_frame(frame, u), last)
     else:
         u = in_frame(frame, direction)
@@ -179,7 +175,7 @@ def _walk_person(walk: Walk) -> None:
     """
     limits, correct, (_, directions, valid, local, _) = walk
     pelvis = line_frame(
-        _row(directions, LEFT_HIP), _row(directions, RIGHT_HIP), _row(directions, SPINE)
+        row_of(directions, LEFT_HIP), row_of(directions, RIGHT_HIP), row_of(directions, SPINE)
     )
     spine = _check_spine(pelvis, walk)
 
@@ -187,7 +183,7 @@ def _walk_person(walk: Walk) -> None:
     hip = _check(HIP, LEFT_HIP, LEFT_HIP + 2, pelvis, _UP, walk)
     valid[RIGHT_HIP] = valid[LEFT_HIP]
     for i in range(2):
-        _set_row(local[RIGHT_HIP], i, _row(local[LEFT_HIP], i))
+        _set_row(local[RIGHT_HIP], i, row_of(local[LEFT_HIP], i))
     if correct and not valid[LEFT_HIP]:
         _rotate_bone(directions, RIGHT_HIP, from_frame(pelvis, _mirrored(hip)), RIGHT_HIP + 2)
     for side in range(2):
@@ -196,7 +192,7 @@ def _walk_person(walk: Walk) -> None:
 
     trunk = product(pelvis, least_rotation(_UP, spine))
     chest = _check(CHEST, CHEST_JOINT, LAST_OF_TRUNK, trunk, _UP, walk)
-    below = product(trunk, least_rotation(_row(limits.rest, CHEST), chest))
+    below = product(trunk, least_rotation(row_of(limits.rest, CHEST), chest))
     for side in range(2):
         joint = LEFT_SHOULDER if side == 0 else RIGHT_SHOULDER
         condition = chest if side == 0 else _mirrored(chest)
@@ -204,26 +200,26 @@ def _walk_person(walk: Walk) -> None:
 
     # The line of the shoulders determines the twist of the trunk.
     trunk = line_frame(
-        _row(directions, LEFT_SHOULDER),
-        _row(directions, RIGHT_SHOULDER),
-        _row(directions, CHEST_JOINT),
+        row_of(directions, LEFT_SHOULDER),
+        row_of(directions, RIGHT_SHOULDER),
+        row_of(directions, CHEST_JOINT),
     )
     neck = _check(NECK, NECK_JOINT, HEAD_JOINT, trunk, chest, walk)
-    below = product(trunk, least_rotation(_row(limits.rest, NECK), neck))
+    below = product(trunk, least_rotation(row_of(limits.rest, NECK), neck))
     _check(HEAD, HEAD_JOINT, HEAD_JOINT, below, neck, walk)
     for side in range(2):
         joint = LEFT_SHOULDER if side == 0 else RIGHT_SHOULDER
         sided = _side_frame(trunk, side)
-        _limb(ELBOW, joint, sided, in_frame(sided, _row(directions, joint)), walk)
+        _limb(ELBOW, joint, sided, in_frame(sided, row_of(directions, joint)), walk)
 
 
 @numba.njit(**NO_ALLOCATION)
 def _check_spine(pelvis: Frame, walk: Walk) -> Vector:
     """Check the tilt of the spine in the left-up plane of the pelvis and return its direction."""
     limits, correct, (_, directions, valid, local, _) = walk
-    if _row(directions, SPINE) == NO_LENGTH:
+    if row_of(directions, SPINE) == NO_LENGTH:
         _set_row(directions, SPINE, pelvis[1])
-    u = in_frame(pelvis, _row(directions, SPINE))
+    u = in_frame(pelvis, row_of(directions, SPINE))
     valid[SPINE] = abs(u[0]) <= limits.tilt
     if correct and not valid[SPINE]:
         # Stay slightly inside the limit despite rounding.
@@ -239,7 +235,7 @@ def _check_spine(pelvis: Frame, walk: Walk) -> Vector:
 def _limb(part: int, joint: int, frame: Frame, condition: Vector, walk: Walk) -> None:
     """Check the two bones below ``joint``: thigh and shin, or upper arm and forearm."""
     first = _check(part, joint + 1, joint + 2, frame, condition, walk)
-    below = product(frame, least_rotation(_row(walk.limits.rest, part), first))
+    below = product(frame, least_rotation(row_of(walk.limits.rest, part), first))
     _check(part + 1, joint + 2, joint + 2, below, first, walk)
 
 

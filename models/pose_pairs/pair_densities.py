@@ -20,7 +20,8 @@ from probmotion.models.pose_pairs.joint_limits_frames import (
     between,
     cross,
     dot,
-    length_of,
+    row_of,
+    unit,
 )
 from probmotion.models.pose_pairs.joint_limits_kernels import (
     Corrections,
@@ -64,7 +65,7 @@ class ViewAnnotations(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """Arrays that compiled functions overwrite, one set per thread."""
+    """Arrays that compiled functions overwrite, in place of new ones."""
 
     pose: np.ndarray  # (J, 3), a proposal
     parts: np.ndarray  # (2 + 2 K,), terms of its log prior
@@ -245,7 +246,7 @@ def project_to_view(pose: np.ndarray, view: int, body: Body, views: ViewAnnotati
 def write_image(pose: np.ndarray, right: Vector, up: Vector, image: np.ndarray) -> None:
     """Write the coordinates of the joints along two axes to ``image`` (2, J)."""
     for joint in range(len(pose)):
-        position = (pose[joint, 0], pose[joint, 1], pose[joint, 2])
+        position = row_of(pose, joint)
         image[0, joint], image[1, joint] = dot(position, right), dot(position, up)
 
 
@@ -261,12 +262,12 @@ def image_axes(
         a * i[1] + b * j[1] + c * k[1],
         a * i[2] + b * j[2] + c * k[2],
     )
-    towards = _unit((x, y, z))
+    towards = unit((x, y, z))
     x, y, z = abs(towards[0]), abs(towards[1]), abs(towards[2])
     across = (0.0, 1.0, 0.0) if y <= z else (0.0, 0.0, 1.0)
     if x <= y and x <= z:
         across = (1.0, 0.0, 0.0)
-    right = _unit(cross(across, towards))
+    right = unit(cross(across, towards))
     return right, cross(towards, right), towards
 
 
@@ -275,14 +276,8 @@ def _local_frame(pose: np.ndarray, body: Body) -> tuple[Vector, Vector, Vector]:
     """Return i, j, k of :func:`~probmotion.interaction.annotations.local_frames.local_frames`."""
     x, y, z = 0.0, 0.0, 0.0
     for person in range(len(body.roots)):
-        along = _unit(between(pose, body.roots[person], body.chests[person]))
+        along = unit(between(pose, body.roots[person], body.chests[person]))
         x, y, z = x + along[0], y + along[1], z + along[2]
-    i = _unit(between(pose, body.roots[0], body.roots[1]))
-    j = _unit((x, y, z))
+    i = unit(between(pose, body.roots[0], body.roots[1]))
+    j = unit((x, y, z))
     return i, j, cross(i, j)
-
-
-@numba.njit(**NO_ALLOCATION)
-def _unit(v: Vector) -> Vector:
-    size = max(length_of(v), 1e-300)
-    return (v[0] / size, v[1] / size, v[2] / size)

@@ -20,6 +20,7 @@ from probmotion.models.pose_pairs.joint_limits_frames import (
     from_frame,
     length_of,
     overwrite,
+    row_of,
 )
 
 __all__ = [
@@ -112,7 +113,7 @@ def propose(
         return
     bone = between(pose, parent, joint)
     if kind == SWING:
-        _turn_about(proposed, below, _position(pose, parent), _rotation((x, y, z)))
+        _turn_about(proposed, below, row_of(pose, parent), _rotation((x, y, z)))
     elif kind == STRETCH:
         ratio = np.exp(x)
         _shift(proposed, below, _change(bone, (ratio * bone[0], ratio * bone[1], ratio * bone[2])))
@@ -169,11 +170,6 @@ def resample_placement(
 
 
 @numba.njit(**NO_ALLOCATION)
-def _position(pose: np.ndarray, joint: int) -> Vector:
-    return (pose[joint, 0], pose[joint, 1], pose[joint, 2])
-
-
-@numba.njit(**NO_ALLOCATION)
 def _middle(pose: np.ndarray, chosen: np.ndarray) -> Vector:
     """Return the mean position of the chosen joints."""
     n_joints, x, y, z = 0, 0.0, 0.0, 0.0
@@ -201,7 +197,7 @@ def _shift(pose: np.ndarray, chosen: np.ndarray, change: Vector) -> None:
 def _turn_about(pose: np.ndarray, chosen: np.ndarray, centre: Vector, turn: Frame) -> None:
     for k in range(len(pose)):
         if chosen[k]:
-            turned = from_frame(turn, _change(centre, _position(pose, k)))
+            turned = from_frame(turn, _change(centre, row_of(pose, k)))
             for i in range(3):
                 pose[k, i] = centre[i] + turned[i]
 

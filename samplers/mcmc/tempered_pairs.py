@@ -67,7 +67,7 @@ class TemperedPairs:
     levels : int
         Number of powers from 0 to 1.
     steps : int
-        Number of Metropolis steps per level between exchanges; at most 40 of powers below 0.03.
+        Number of Metropolis steps per level between exchanges; at most 40 at powers below 0.03.
     warmup : int
         Number of exchanges before the first draw, used to tune powers and step sizes.
     thin : int
