@@ -44,8 +44,8 @@ def approach(
     is multiplied by ``ratio``. That bone has the length of the pose's and is on the same side of
     the image plane, or in it if it is too long. The inverse move has the ratio 1/``ratio``; −∞ if
     there is none, because a bone would change sides. The annotation is rotated in the image to fit
-    the joints that define the local frame. Their bones stay, so the view and the
-    rotation stay too. ``image`` (2, J) is a workspace array.
+    the joints that define the local frame. Their bones stay, so the view and the rotation stay too.
+    ``image`` (2, J) is a workspace array.
     """
     right, up, towards = image_axes(pose, view, body, views)
     joints, n_joints = views.prepared.joints[annotation], len(pose)
