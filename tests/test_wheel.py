@@ -57,7 +57,13 @@ def test_wheel_contains_every_module_and_nothing_else(wheel):
     }  # fmt: skip
     data |= {
         f"problems/references/{name}/{file}"
-        for name in ("dance-pairs", "gait-noisy3d", "salsa-pairs", "walk-vae-monocular")
+        for name in (
+            "dance-pairs",
+            "gait-noisy3d",
+            "salsa-pairs",
+            "salsa-physical",
+            "walk-vae-monocular",
+        )
         for file in ("draws.npz", "certificate.json")
     }
     weights = [

@@ -132,7 +132,23 @@ class PoseChart:
         Gaussian, all normalised. Rotations beyond π have density 0, so each direction counts once.
         """
         theta = to_numpy(theta)
-        turns, translations, bends, stretches = self._parts(theta)
+        _, translations, _, stretches = self._parts(theta)
+        total = self._log_directions(theta) + _log_normal(stretches, self.bone_noise)
+        return total + _log_normal(translations.reshape(*theta.shape[:-1], -1), self.root_noise)
+
+    def log_volume(self, theta: np.ndarray) -> np.ndarray:
+        """Return the log density of θ for positions of uniform density: ``(…, dim) → (…)``.
+
+        The volume element of a bone of length l is l³ d(log l) d(direction). Root rotations, on
+        which positions do not depend, are uniform.
+        """
+        stretches = self._parts(theta)[-1]
+        lengths = np.linalg.norm(self._bones, axis=-1)
+        return self._log_directions(theta) + 3 * (stretches + np.log(lengths)).sum(axis=-1)
+
+    def _log_directions(self, theta: np.ndarray) -> np.ndarray:
+        """Return the log density of uniform rotations of the roots and directions of the bones."""
+        turns, _, bends, _ = self._parts(theta)
         angle = np.linalg.norm(turns, axis=-1)
         bend = np.linalg.norm(bends, axis=-1)
         inside = (angle < np.pi).all(axis=-1) & (bend < np.pi).all(axis=-1)
@@ -140,9 +156,7 @@ class PoseChart:
         haar = 2 * np.log(np.sinc(angle / (2 * np.pi)) / 2) + np.log(1 / (2 * np.pi**2))
         with np.errstate(divide="ignore", invalid="ignore"):
             area = np.log(np.sinc(bend / np.pi) / (4 * np.pi))
-        total = (haar.sum(axis=-1) + area.sum(axis=-1)) + _log_normal(stretches, self.bone_noise)
-        total = total + _log_normal(translations.reshape(*theta.shape[:-1], -1), self.root_noise)
-        return np.where(inside, total, -np.inf)
+        return np.where(inside, haar.sum(axis=-1) + area.sum(axis=-1), -np.inf)
 
     def speeds(self, turn: np.ndarray, stretch: np.ndarray) -> np.ndarray:
         """Return mean squared steps of the coordinates, (…, dim), from those of joints (eq. 12).

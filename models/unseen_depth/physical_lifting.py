@@ -40,9 +40,14 @@ from probmotion.posteriors.sampling import progress_bar
 from probmotion.threads import only_one_thread
 from probmotion.validation import check_count
 
-__all__ = ["physical_lifts"]
+__all__ = [
+    "LEAST_POWER", "LiftMixture", "checked_keypoints", "lift_mixtures", "physical_lifts",
+    "valid_start",
+]  # fmt: skip
 
-_POWERS = np.geomspace(0.15, 1.0, 6)  # of b(X); four to five of ten swaps are accepted
+LEAST_POWER = 0.15
+"""Power of b(X) at which limbs pass through the image plane."""
+_POWERS = np.geomspace(LEAST_POWER, 1.0, 6)  # Four to five of ten swaps are accepted.
 _INITIAL_SIZE = 0.03  # of the steps, radians, metres or log length
 _LEAST_VARIANCE = 1e-9  # relative; the variance of the mean depth is 0
 
@@ -93,34 +98,17 @@ def physical_lifts(
         If the joints differ, keypoints are not at the scale of the people, or the prior's noise is
         so small that covariances cannot be factorised.
     """
-    if physics.skeleton.n_joints != prior.n_joints:
-        raise ValueError(
-            f"physics must have the prior's {prior.n_joints} joints, got "
-            f"{physics.skeleton.n_joints}"
-        )
-    if isinstance(annotations, Annotations):
-        names = annotations.skeleton.canonical_names
-        if names != physics.skeleton.canonical_names:
-            raise ValueError(
-                "annotations must have the joints of physics, "
-                f"{', '.join(physics.skeleton.canonical_names)}, got {', '.join(names)}"
-            )
     check_count("draws", draws)
     check_count("warmup", warmup)
     check_count("sweeps", sweeps)
-    keypoints = as_keypoints(annotations, prior.n_joints)
-    check_size(keypoints, prior.means[0], "multiply them by lift(…, unknown_scale=True).scales")
-    images, centres = centred_images(keypoints)
+    images, centres = centred_images(checked_keypoints(annotations, prior, physics))
     moves = moves_of(physics.body)
     moves = moves[moves[:, 0] != APPROACH]
     out = np.empty((draws, len(images), prior.n_joints, 3))
 
-    def walk(mixture: _Mixture) -> None:
+    def walk(mixture: LiftMixture) -> None:
         rng = seeds.generator(seed, "physical lift", mixture.row)
-        poses = np.stack([mixture.draw(rng) for _ in _POWERS])
-        for pose in poses:
-            if (~physics.joint_limits.is_valid(pose)).sum() > physics.max_invalid:
-                pose[:] = physics.joint_limits.nearest_valid(pose)
+        poses = np.stack([valid_start(mixture, physics, rng) for _ in _POWERS])
         log_sizes = np.full((len(_POWERS), 2, APPROACH), math.log(_INITIAL_SIZE))
         for number in range(-1, draws):
             first = warmup + number * sweeps if number >= 0 else 0
@@ -135,7 +123,7 @@ def physical_lifts(
 
     cores = 1 if only_one_thread() else os.cpu_count() or 1
     with progress_bar(len(images), "lifts", progress) as bar, ThreadPoolExecutor(cores) as threads:
-        for mixtures in _mixtures(prior, images):
+        for mixtures in lift_mixtures(prior, images):
             futures = [threads.submit(walk, mixture) for mixture in mixtures]
             try:
                 for future in as_completed(futures):
@@ -148,8 +136,35 @@ def physical_lifts(
     return out
 
 
-class _Mixture(NamedTuple):
-    """Gaussian mixture posterior of annotation ``row``, arguments of :func:`walk_lift`."""
+def checked_keypoints(
+    annotations: Annotations | np.ndarray, prior: AnnotationPrior, physics: PosePairPrior
+) -> np.ndarray:
+    """Return the keypoints (n, J, 2) of annotations that have the joints and size of both priors.
+
+    Raises
+    ------
+    ValueError
+        If they have not.
+    """
+    if physics.skeleton.n_joints != prior.n_joints:
+        raise ValueError(
+            f"physics must have the prior's {prior.n_joints} joints, got "
+            f"{physics.skeleton.n_joints}"
+        )
+    if isinstance(annotations, Annotations):
+        names = annotations.skeleton.canonical_names
+        if names != physics.skeleton.canonical_names:
+            raise ValueError(
+                "annotations must have the joints of physics, "
+                f"{', '.join(physics.skeleton.canonical_names)}, got {', '.join(names)}"
+            )
+    keypoints = as_keypoints(annotations, prior.n_joints)
+    check_size(keypoints, prior.means[0], "multiply them by lift(…, unknown_scale=True).scales")
+    return keypoints
+
+
+class LiftMixture(NamedTuple):
+    """Gaussian mixture N(X) p(y | X) of annotation ``row``, arguments of :func:`walk_lift`."""
 
     row: int
     weights: np.ndarray
@@ -167,7 +182,17 @@ class _Mixture(NamedTuple):
         return np.ascontiguousarray(flat.reshape(3, -1).T)
 
 
-def _mixtures(prior: AnnotationPrior, images: np.ndarray) -> Iterator[list[_Mixture]]:
+def valid_start(
+    mixture: LiftMixture, physics: PosePairPrior, rng: np.random.Generator
+) -> np.ndarray:
+    """Draw a pose (J, 3) of a mixture; the nearest valid one if too many joints are invalid."""
+    pose = mixture.draw(rng)
+    if (~physics.joint_limits.is_valid(pose)).sum() > physics.max_invalid:
+        return physics.joint_limits.nearest_valid(pose)
+    return pose
+
+
+def lift_mixtures(prior: AnnotationPrior, images: np.ndarray) -> Iterator[list[LiftMixture]]:
     """Yield the posteriors of images (n, 2 J) with the same visible joints."""
     for rows, visible in visibility_groups(images):
         evidence = prior.cells.evidence(images[rows], visible, False)
@@ -184,7 +209,7 @@ def _mixtures(prior: AnnotationPrior, images: np.ndarray) -> Iterator[list[_Mixt
             cells = np.array([number for number, _ in members[index]])
             probabilities = np.array([parts[p].weights[i] for p, i in members[index]])
             mixtures.append(
-                _Mixture(
+                LiftMixture(
                     row=int(row),
                     weights=probabilities,
                     log_weights=np.log(probabilities) - norms[cells],

@@ -14,7 +14,7 @@ from probmotion.models.pose_pairs.pair_densities import (
 )
 from probmotion.models.pose_pairs.pair_moves import SHIFT, TURN, Body, propose
 
-__all__ = ["walk_lift"]
+__all__ = ["walk_lift", "walk_replica"]
 
 _STEPS = 50  # Metropolis steps of a replica between swaps
 _TARGET_ACCEPTANCE = 0.3
@@ -50,13 +50,17 @@ def walk_lift(
     which ``cells`` (c,) selects those of the components.
     """
     replicas = len(powers)
-    squares = np.empty(replicas)
+    squares, counts = np.empty(replicas), np.empty((2, *log_sizes.shape[1:]))
     for sweep in range(first, first + sweeps):
         for k in range(replicas):
-            _walk(
-                poses[k], log_weights, means, cells, roots, powers[k], moves, log_sizes[k],
-                sweep * _STEPS if tune else -1, body, physics, rng,
+            counts[:] = 0.0
+            walk_replica(
+                poses[k], log_weights, means, cells, roots, powers[k], _STEPS, moves,
+                np.exp(log_sizes[k]), counts[0], counts[1], body, physics, rng,
             )  # fmt: skip
+            if tune:
+                surplus = counts[1] - _TARGET_ACCEPTANCE * counts[0]
+                log_sizes[k] += surplus / np.sqrt(_STEPS * (sweep + 1.0))
             squares[k] = log_lengths(poses[k], body)[1]
         for k in range(sweep % 2, replicas - 1, 2):
             change = (powers[k + 1] - powers[k]) * (squares[k + 1] - squares[k])
@@ -66,16 +70,18 @@ def walk_lift(
 
 
 @numba.njit(cache=True, nogil=True)
-def _walk(
+def walk_replica(
     pose: np.ndarray,
     log_weights: np.ndarray,
     means: np.ndarray,
     cells: np.ndarray,
     roots: np.ndarray,
     power: float,
+    n_steps: int,
     moves: np.ndarray,
-    log_sizes: np.ndarray,
-    tuned: int,
+    sizes: np.ndarray,
+    tried: np.ndarray,
+    taken: np.ndarray,
     body: Body,
     physics: Physics,
     rng: np.random.Generator,
@@ -83,8 +89,8 @@ def _walk(
     """Draw the component given ``pose``, then move ``pose`` by Metropolis steps.
 
     Half of the shifts and rotations are in depth, where a pose is less certain than in the image.
-    ``tuned`` is the number of steps for which ``log_sizes`` were tuned; they are not if it is
-    negative.
+    ``sizes`` (2, kinds) of moves are those in all directions and in depth. The numbers of tried and
+    taken moves, ``tried`` and ``taken`` (2, kinds), are updated.
     """
     people = len(body.roots)
     work = workspace(body, physics, 0)
@@ -97,12 +103,12 @@ def _walk(
     parts[1] = log_penetration(pose, physics, work)
     for person in range(people):
         write_limit_terms(pose, person, physics, parts, work)
-    for step in range(_STEPS):
+    for _ in range(n_steps):
         number = int(rng.random() * len(moves))
         kind, joint = moves[number, 0], moves[number, 1]
         depth = int(rng.random() * 2)
-        size = np.exp(log_sizes[depth, kind])
-        propose(pose, moves[number], size, body, rng, proposed, depth == 1)
+        tried[depth, kind] += 1
+        propose(pose, moves[number], sizes[depth, kind], body, rng, proposed, depth == 1)
         new_parts[:] = parts
         # Delayed acceptance: the Gaussian first (Christen and Fox 2005).
         new_white[:] = white
@@ -119,8 +125,7 @@ def _walk(
             accepted = -rng.standard_exponential() < gain
         if accepted:
             pose[:], parts[:], white[:] = proposed, new_parts, new_white
-        if tuned >= 0:
-            log_sizes[depth, kind] += (accepted - _TARGET_ACCEPTANCE) / np.sqrt(1.0 + tuned + step)
+            taken[depth, kind] += 1
 
 
 @numba.njit(cache=True, nogil=True)

@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from probmotion.motion.motion import Motion
 from probmotion.posteriors.problem import Problem
 
@@ -17,6 +19,8 @@ if TYPE_CHECKING:
     from probmotion.models.pose_pairs.pair_posterior import PairSettings
 
 __all__ = ["PAIR_PROBLEMS", "pairs_problem"]
+
+_VIEW = 0.0, np.pi / 12  # azimuth and elevation of the camera of `salsa-physical`, radians
 
 
 def pairs_problem(
@@ -100,11 +104,42 @@ def _salsa(name: str, description: str, paper: bool = False) -> Problem:
     )
 
 
+_PHYSICAL = (
+    "salsa pair of a held-out clip lifted from one 2D annotation (σ 3 cm, unknown view), with a "
+    "prior learnt from annotations and the physical prior"
+)
+
+
+def _physical_lift() -> Problem:
+    from pathlib import Path
+
+    from probmotion import models, seeds
+    from probmotion.data.downloads import salsa_pairs
+    from probmotion.data.pair_sets import choose_seed, ground_truth, hold_out
+    from probmotion.interaction.annotations.sources import world_axes
+    from probmotion.models.pose_pairs import PosePairPrior
+    from probmotion.models.unseen_depth.annotation_prior import AnnotationPrior
+    from probmotion.models.unseen_depth.physical_lift import PhysicalLift
+    from probmotion.posteriors.posterior import MotionPosterior
+
+    training, test = hold_out(salsa_pairs())
+    learnt = AnnotationPrior.load(Path(models.__file__).parent / "weights" / "salsa-pairs.npz")
+    poses = ground_truth(training)[0]
+    physics = PosePairPrior(poses[choose_seed(poses)], training[0].skeleton, training[0].fps)
+    # The pose in the middle of the held-out dance, in the axes of the camera.
+    pose = ground_truth(test, 1)[0][0] @ world_axes(np.array([_VIEW]))[0].T
+    pose = pose - pose.mean(axis=0)
+    noise = learnt.noise * seeds.generator(0, "annotation").standard_normal((len(pose), 2))
+    posterior = MotionPosterior(PhysicalLift(learnt, pose[:, :2] + noise, physics))
+    return Problem("salsa-physical", _PHYSICAL, posterior, truth=pose[None])
+
+
 _PAPER = "salsa-pairs with the density truncated at 100 times the seed's, as published"
 
 PAIR_PROBLEMS: Mapping[str, tuple[str, Callable[[], Problem]]] = {
     "dance-pairs": (_DANCE, _dance),
     "salsa-pairs": (_SALSA, partial(_salsa, "salsa-pairs", _SALSA)),
     "salsa-pairs-paper": (_PAPER, partial(_salsa, "salsa-pairs-paper", _PAPER, paper=True)),
+    "salsa-physical": (_PHYSICAL, _physical_lift),
 }
 """Description and factory of each problem, by name."""

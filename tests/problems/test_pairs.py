@@ -11,10 +11,11 @@ from probmotion.data.pair_sets import SALSA_HELD_OUT
 from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.metrics.coverage import coverage
 from probmotion.metrics.measures import measure
+from probmotion.models.unseen_depth import physical_lifts
 from probmotion.posteriors.problem import Problem
 from probmotion.posteriors.truncation import TruncatedPosterior
 from probmotion.problems import load_problem, pairs_problem, problem_descriptions, problem_names
-from probmotion.samplers import MetropolisHastings
+from probmotion.samplers import MetropolisHastings, TemperedPairs
 from probmotion.samplers.mcmc.proposals import Isotropic
 
 
@@ -43,6 +44,41 @@ def test_clips_are_held_out_completely(problem):
     assert np.abs(training - seed).max(axis=(1, 2)).min() == 0
     sources = set(problem.posterior.likelihood.annotations.sources)
     assert sources <= {f"dance-{number}" for number in range(6)}
+
+
+@pytest.fixture
+def lifted(real_data, monkeypatch, tmp_path) -> Problem:
+    """Return the problem of one lift, with the shipped reference draws."""
+    monkeypatch.setenv("PROBMOTION_DATA", str(tmp_path))
+    (tmp_path / "cmu_salsa_pairs").symlink_to(real_data / "cmu_salsa_pairs")
+    return load_problem("salsa-physical")
+
+
+def test_lifted_annotation_is_of_the_truth(lifted):
+    lift = lifted.posterior.prior
+    deviations = (lift.keypoints - lifted.truth[0, :, :2]).ravel()
+    assert deviations.std() == pytest.approx(lift.learnt.noise, rel=0.3)
+    # Noise and joints: the truth has the density of draws.
+    log_density = lift.log_prior(lifted.stored.positions.astype(float))
+    assert lift.log_prior(lifted.truth) > log_density.mean() - 6 * log_density.std()
+
+
+@pytest.mark.slow
+def test_physical_lifts_agree_with_the_reference(lifted):
+    """After more sweeps than by default, which do not forget the start entirely."""
+    lift, rng = lifted.posterior.prior, np.random.default_rng(0)
+    annotations = np.repeat(lift.keypoints[None], 200, axis=0)
+    right = physical_lifts(lift.learnt, annotations, lift.physics, warmup=256, sweeps=512)[0]
+    wrong = lift.learnt.sample_lifts(annotations, rng, 1)[0]  # without the physical prior
+    verdicts = []
+    for poses in (right, wrong):
+        poses[..., 2] += lift.depth_sd * rng.standard_normal((200, 1))
+        draws = MotionDraws.of(
+            lifted.posterior, TemperedPairs(), poses[None, :, None], seed=0, seconds=1.0,
+            independent=True,
+        )  # fmt: skip
+        verdicts.append(pm.score(lifted, draws).verdict)
+    assert [verdict.is_wrong for verdict in verdicts] == [False, True]
 
 
 def test_metrics_include_coverage_and_are_invariant_to_translation(problem):

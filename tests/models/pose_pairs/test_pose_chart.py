@@ -82,6 +82,23 @@ def test_measure_is_normalised():
     assert density(0, 3.2) == density(6, 3.2) == 0
 
 
+def test_volume_is_that_of_the_positions():
+    """For given rotations of the roots, positions are a bijection of the other coordinates."""
+    chart = chart_of(PAIR)
+    thetas = 0.4 * np.random.default_rng(4).standard_normal((3, chart.dim))
+    thetas[0, :6] = 0
+    thetas[2, :6] = thetas[1, :6]
+    with jax.enable_x64(True):
+        slopes = jax.vmap(jax.jacfwd(chart.positions))(jax.numpy.asarray(thetas))
+    slopes = np.asarray(slopes).reshape(3, 3 * PAIR.n_joints, chart.dim)[..., 6:]
+    ratios = chart.log_volume(thetas) - np.linalg.slogdet(slopes)[1]
+    # Uniform densities of 32 directions and, at the identity, of two rotations.
+    expected = -32 * np.log(4 * np.pi) - 2 * np.log(8 * np.pi**2)
+    assert ratios[0] == pytest.approx(expected, abs=1e-9)
+    assert ratios[1] == pytest.approx(ratios[2], abs=1e-9)
+    assert chart.log_volume(np.full(chart.dim, 2.0)) == -np.inf
+
+
 def test_array_libraries_agree():
     chart = chart_of(PAIR)
     theta = 0.4 * np.random.default_rng(2).standard_normal((5, chart.dim))

@@ -6,7 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
 
+from probmotion import MotionPosterior
 from probmotion.data.pair_sets import choose_seed, dance_frames, ground_truth
 from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.interaction.annotations.annotations import Annotations
@@ -21,11 +24,17 @@ from probmotion.models.pose_pairs.pair_moves import (
     moves_of,
     propose,
 )
-from probmotion.models.unseen_depth import AnnotationPrior, physical_lifting as physical
+from probmotion.models.unseen_depth import (
+    AnnotationPrior,
+    PhysicalLift,
+    physical_lifting as physical,
+)
 from probmotion.models.unseen_depth.keypoints import centred_images
 from probmotion.models.unseen_depth.physical_lifting import physical_lifts
 from probmotion.motion.skeleton import Skeleton
+from probmotion.samplers import TemperedPairs
 from probmotion.threads import one_thread
+from tests.models.pose_pairs.small_dances import z_scores
 
 SKELETON = Skeleton.preset("pair17")
 
@@ -70,7 +79,7 @@ def test_draws_match_importance_weighted_lifts(
     """The weights are the physical prior; without it, draws have the closed-form posterior."""
     annotation = keypoints[:1].copy()
     annotation[:, hidden] = np.nan
-    mixtures = physical._mixtures
+    mixtures = physical.lift_mixtures
 
     def in_one_view(prior, images):
         """Yield mixtures that start in their most probable view."""
@@ -80,7 +89,7 @@ def test_draws_match_importance_weighted_lifts(
             ]
 
     if bone_noise == 1e3 and not hidden:  # Others need more steps from there.
-        monkeypatch.setattr(physical, "_mixtures", in_one_view)
+        monkeypatch.setattr(physical, "lift_mixtures", in_one_view)
     physics = PosePairPrior(
         pose,
         SKELETON,
@@ -89,27 +98,72 @@ def test_draws_match_importance_weighted_lifts(
         bone_noise=bone_noise,
         position_noise=position_noise,
     )
-    exact = prior.sample_lifts(annotation, np.random.default_rng(0), 20_000)[:, 0]
-    lengths = log_lengths(exact, pose)
-    log_weights = physics.log_plausibility(exact[:, None])
-    log_weights = log_weights - 0.5 * (lengths / bone_noise) ** 2 @ np.ones(lengths.shape[1])
-    weights = np.exp(log_weights - log_weights.max())
-    weights /= weights.sum()
-    assert 1 / (weights**2).sum() > 1000
+    exact, weights = weighted_lifts(prior, annotation, physics)
     monkeypatch.setattr(physical, "_POWERS", np.array([0.4, 1.0]))  # Two replicas are faster.
     many = np.repeat(annotation, 120, axis=0)
     draws = physical_lifts(prior, many, physics, warmup=60, sweeps=1)[0]
-    for values, of_exact in (
-        (log_lengths(draws, pose), lengths),
-        (draws[..., 2], exact[..., 2]),
-        (draws[..., 0], exact[..., 0]),
-        (draws[..., 2] ** 2, exact[..., 2] ** 2),
-        (physics.log_plausibility(draws[:, None]), physics.log_plausibility(exact[:, None])),
-    ):
-        mean = weights @ of_exact
-        variance = weights**2 @ (of_exact - mean) ** 2 + values.var(axis=0) / len(values)
-        z = (values.mean(axis=0) - mean) / np.sqrt(variance)
-        assert abs(z).max() < 4.5
+    values, expected = (summaries(poses, physics) for poses in (draws, exact))
+    mean = weights @ expected
+    variance = weights**2 @ (expected - mean) ** 2 + values.var(axis=0) / len(values)
+    z = (values.mean(axis=0) - mean) / np.sqrt(variance)
+    assert abs(z).max() < 4.5
+
+
+def test_tempered_draws_match_importance_weighted_lifts(prior, keypoints, pose):
+    physics = PosePairPrior(
+        pose, SKELETON, max_invalid=99, penetration_weight=30.0, bone_noise=0.6, position_noise=0.3
+    )
+    lift = PhysicalLift(prior, keypoints[0], physics, depth_sd=0.1)
+    sampler = TemperedPairs(levels=3, steps=100, warmup=64, thin=4)
+    run = sampler.sample(MotionPosterior(lift), draws=150, chains=4, progress=False)
+    poses = run.positions.values[:, :, 0]
+    depths = poses[..., 2].mean(axis=-1)
+    assert depths.std() == pytest.approx(0.1, rel=0.15)
+    poses[..., 2] -= depths[..., None]
+    exact, weights = weighted_lifts(prior, keypoints[:1], physics)
+    expected = summaries(exact, physics)
+    mean = weights @ expected
+    error = np.sqrt(weights**2 @ (expected - mean) ** 2)
+    assert abs(z_scores(summaries(poses, physics), mean, error)).max() < 4.5
+
+
+def weighted_lifts(prior, annotation, physics):
+    """Return lifts without the physical prior, and their importance weights, which it is."""
+    exact = prior.sample_lifts(annotation, np.random.default_rng(0), 20_000)[:, 0]
+    lengths = log_lengths(exact, physics.chart.seed)
+    log_weights = physics.log_plausibility(exact[:, None])
+    log_weights = log_weights - 0.5 * (lengths**2).sum(axis=-1) / physics.bone_noise**2
+    weights = np.exp(log_weights - log_weights.max())
+    weights /= weights.sum()
+    assert 1 / (weights**2).sum() > 1000
+    return exact, weights
+
+
+def summaries(poses, physics):
+    """Return log bone lengths, x, depths and their squares, and log plausibility: (…, k)."""
+    lengths, depths = log_lengths(poses, physics.chart.seed), poses[..., 2]
+    plausibility = physics.log_plausibility(poses[..., None, :, :])[..., None]
+    return np.concatenate([lengths, poses[..., 0], depths, depths**2, plausibility], axis=-1)
+
+
+def test_density_is_that_of_the_mixture_and_the_physical_prior(prior, keypoints, pose):
+    lift = PhysicalLift(prior, keypoints[0], PosePairPrior(pose, SKELETON), depth_sd=0.1)
+    poses, mixture = lift.seed, lift.mixture
+    flat = np.swapaxes(poses, 1, 2).reshape(len(poses), -1)
+    in_depth = np.repeat([0.0, 0.0, 1.0], 34)
+    logs = []
+    for weight, mean, cell in zip(mixture.weights, mixture.means, mixture.cells, strict=True):
+        spread = mixture.spreads[cell]
+        covariance = spread @ spread.T + 0.1**2 * np.outer(in_depth, in_depth)
+        logs.append(np.log(weight) + multivariate_normal(mean, covariance).logpdf(flat))
+    expected = logsumexp(logs, axis=0) + lift.physics.log_plausibility(poses[:, None])
+    expected -= 0.5 * (log_lengths(poses, pose) ** 2).sum(axis=-1) / lift.physics.bone_noise**2
+    np.testing.assert_allclose(np.diff(lift.log_prior(poses[:, None])), np.diff(expected))
+    theta = lift.physics.coordinates(poses)
+    log_volume = lift.physics.chart.log_volume(theta)
+    np.testing.assert_allclose(lift.log_density(theta) - log_volume, lift.log_prior(poses[:, None]))
+    theta[:-1, 0], theta[-1, 14::3] = 4.0, 800.0  # rotations beyond π, infinite bones
+    assert (lift.log_density(theta) == -np.inf).all()
 
 
 def test_draws_have_the_bones_of_the_people_and_keep_to_the_image(prior, keypoints, pose):
@@ -167,7 +221,7 @@ def test_steps_in_depth_are_larger(prior, keypoints, pose, monkeypatch):
 def test_swaps_have_the_densities_of_the_replicas(prior, keypoints, pose):
     """Two poses whose bones keep their lengths are exchanged between powers 0.2 and 1."""
     physics = PosePairPrior(pose, SKELETON)
-    [[mixture]] = physical._mixtures(prior, centred_images(keypoints[:1])[0])
+    [[mixture]] = physical.lift_mixtures(prior, centred_images(keypoints[:1])[0])
     given = mixture.log_weights, mixture.means, mixture.cells, mixture.roots
     moves, rigid = moves_of(physics.body), np.full((2, 2, APPROACH), -60.0)
     moves, powers = moves[moves[:, 0] != APPROACH], np.array([0.2, 1.0])
@@ -196,8 +250,11 @@ def test_wrong_input(prior, keypoints, pose):
         prior.weights, prior.means[:, 1:], prior.covariances[:, 3:, 3:], prior.noise, prior.views
     )
     physics = PosePairPrior(pose, SKELETON)
-    with pytest.raises(ValueError, match="physics must have the prior's 33 joints, got 34"):
-        physical_lifts(other, keypoints[:, 1:], physics)
+    for function, given in ((physical_lifts, keypoints[:, 1:]), (PhysicalLift, keypoints[0, 1:])):
+        with pytest.raises(ValueError, match="physics must have the prior's 33 joints, got 34"):
+            function(other, given, physics)
+    with pytest.raises(ValueError, match="depth_sd must be"):
+        PhysicalLift(prior, keypoints[0], physics, depth_sd=0.0)
     with pytest.raises(ValueError, match=r"scale of the people, .* multiply them by lift\("):
         physical_lifts(prior, 200 * keypoints, physics)
     with pytest.raises(ValueError, match="must have variances of at least 1e-09 of the largest"):

@@ -329,11 +329,12 @@ def test_truncation_changes_the_fingerprint():
 
 
 @pytest.mark.parametrize(
-    "name", ["dance-pairs", "gait-noisy3d", "walk-vae-monocular", "salsa-pairs"]
+    "name",
+    ["dance-pairs", "gait-noisy3d", "walk-vae-monocular", "salsa-pairs", "salsa-physical"],
 )
 def test_shipped_references_are_valid(name, request, monkeypatch, tmp_path):
     monkeypatch.setenv("PROBMOTION_DATA", str(tmp_path))
-    if name == "salsa-pairs":
+    if name.startswith("salsa-"):
         real_data = request.getfixturevalue("real_data")
         (tmp_path / "cmu_salsa_pairs").symlink_to(real_data / "cmu_salsa_pairs")
     certificate = load_problem(name).stored.certificate
