@@ -27,6 +27,7 @@ from probmotion.models.pose_pairs.pair_moves import (
 from probmotion.models.unseen_depth import (
     AnnotationPrior,
     PhysicalLift,
+    physical_lift,
     physical_lifting as physical,
 )
 from probmotion.models.unseen_depth.keypoints import centred_images
@@ -144,6 +145,23 @@ def summaries(poses, physics):
     lengths, depths = log_lengths(poses, physics.chart.seed), poses[..., 2]
     plausibility = physics.log_plausibility(poses[..., None, :, :])[..., None]
     return np.concatenate([lengths, poses[..., 0], depths, depths**2, plausibility], axis=-1)
+
+
+def test_powers_of_walks_are_those_of_the_likelihood(prior, keypoints, pose, monkeypatch):
+    """The least power is part of the prior, and walks at power 1 target the density."""
+    kept = []
+    monkeypatch.setattr(physical_lift, "walk_replica", lambda *given: kept.append(given[5]))
+    lift = PhysicalLift(prior, keypoints[0], PosePairPrior(pose, SKELETON))
+    walks, powers = lift.walks(None), np.array([0.0, 0.4, 1.0])
+    sizes, counts = np.ones(len(walks.moves)), np.zeros((2, len(walks.moves)))
+    for power in powers:
+        walks.walk(
+            lift.seed[0].copy(), np.empty(0), 0, power, 1, sizes, *counts, np.random.default_rng(0)
+        )
+    log_bones = lift.log_bones(lift.seed[0])
+    expected = physical.LEAST_POWER * log_bones + powers * walks.log_view(lift.seed[0], 0)
+    np.testing.assert_allclose(np.array(kept) * log_bones, expected)
+    assert kept[-1] == pytest.approx(1.0)
 
 
 def test_density_is_that_of_the_mixture_and_the_physical_prior(prior, keypoints, pose):
