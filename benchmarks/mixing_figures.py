@@ -3,8 +3,8 @@
 ``…_swd…``: the smallest mean ``swd_ratio``; of that sampler, ``…_mode_proportions_tv`` and
 ``…_rhat``: the largest over seeds, where there are modes. ``problems_without_a_right_sampler``:
 problems with exact draws or a reference on which the sampler that ``probmotion which`` recommends
-after 6 s has warnings, and no sampler here is right. Results are stored in the package for that
-command.
+after 6 s has warnings, and no sampler here is right. Results are stored in the package; where a
+recommendation has warnings, that command names the cheapest of those that are right.
 """
 
 from __future__ import annotations

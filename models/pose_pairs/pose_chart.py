@@ -137,7 +137,7 @@ class PoseChart:
         return total + _log_normal(translations.reshape(*theta.shape[:-1], -1), self.root_noise)
 
     def log_volume(self, theta: np.ndarray) -> np.ndarray:
-        """Return the log density of θ for positions of uniform density: ``(…, dim) → (…)``.
+        """Return the log density of θ for uniform positions (Lebesgue measure): ``(…, dim) → (…)``.
 
         The volume element of a bone of length l is l³ d(log l) d(direction). Root rotations, on
         which positions do not depend, are uniform.

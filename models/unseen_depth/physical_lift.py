@@ -9,7 +9,7 @@ import numpy as np
 
 from probmotion import seeds
 from probmotion.arrays import Array, logsumexp, to_numpy
-from probmotion.models.pose_pairs.pair_moves import APPROACH, moves_of
+from probmotion.models.pose_pairs.pair_moves import APPROACH
 from probmotion.models.pose_pairs.pose_pairs import PosePairPrior
 from probmotion.models.unseen_depth.annotation_prior import AnnotationPrior
 from probmotion.models.unseen_depth.keypoints import centred_images
@@ -18,6 +18,7 @@ from probmotion.models.unseen_depth.physical_lifting import (
     LiftMixture,
     checked_keypoints,
     lift_mixtures,
+    lift_moves,
     valid_start,
 )
 from probmotion.models.unseen_depth.physical_lifting_kernels import walk_replica
@@ -27,7 +28,7 @@ from probmotion.validation import check_positive, check_shape
 
 __all__ = ["LiftWalks", "PhysicalLift"]
 
-_STARTS = 8  # of walks
+_STARTS = 4  # of walks, as many as chains by default
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +36,8 @@ class PhysicalLift:
     """p(X | y) of :mod:`.physical_lifting` for one annotation y, with a density of the mean depth.
 
     θ are the coordinates of ``physics.chart``. Positions are in the axes of the camera, x and y in
-    place; the mean depth of the joints, which an image does not show, is normal.
+    place; the mean depth of the joints, which an image does not show, is normal. The annotation is
+    part of this prior: its posterior has no likelihood.
 
     Parameters
     ----------
@@ -53,7 +55,7 @@ class PhysicalLift:
     Raises
     ------
     ValueError
-        As :func:`~.physical_lifting.physical_lifts`.
+        As :func:`~.physical_lifting.physical_lifts`, or if ``depth_sd`` is not positive.
     """
 
     learnt: AnnotationPrior
@@ -67,8 +69,12 @@ class PhysicalLift:
 
     def __post_init__(self) -> None:
         check_positive("depth_sd", self.depth_sd)
-        keypoints = checked_keypoints(np.asarray(self.keypoints)[None], self.learnt, self.physics)
-        images, [centre] = centred_images(keypoints)
+        keypoints = np.array(self.keypoints, dtype=np.float64)
+        check_shape("keypoints", keypoints, ("J", 2))
+        images, [centre] = centred_images(
+            checked_keypoints(keypoints[None], self.learnt, self.physics)
+        )
+        object.__setattr__(self, "keypoints", keypoints)
         [[mixture]] = lift_mixtures(self.learnt, images)
         offset = np.repeat([*centre, 0.0], self.learnt.n_joints)
         object.__setattr__(self, "mixture", mixture._replace(means=mixture.means + offset))
@@ -90,7 +96,7 @@ class PhysicalLift:
 
     @cached_property
     def seed(self) -> np.ndarray:
-        """Poses at which walks start, (8, J, 3), metres."""
+        """Poses at which walks start, (4, J, 3), metres."""
         return self._starts(seeds.generator(0, "physical lift", "starts"), _STARTS)
 
     def motion(self, theta: Array) -> Array:
@@ -101,17 +107,29 @@ class PhysicalLift:
         """Return n initial points, (n, dim): lifts without the physical prior, made valid."""
         return self.physics.coordinates(self._starts(rng, n))
 
+    def check_observations(self, likelihood: Likelihood) -> None:
+        """Raise ``ValueError``, as the annotation is part of the prior."""
+        raise ValueError(
+            "likelihood must be None, since the annotation is part of PhysicalLift, got "
+            f"{type(likelihood).__name__}"
+        )
+
     def log_density(self, theta: Array) -> np.ndarray:
         """Return log p(θ), up to a constant: ``(…, dim) → (…)``."""
         theta = to_numpy(theta)
-        log_volume = self.physics.chart.log_volume(theta)
-        # Exponentials of log bone lengths can overflow.
+        log_measure = self.log_measure(theta)
+        # Bone lengths, or their squares, can overflow; they have density 0.
         with np.errstate(over="ignore", invalid="ignore"):
             positions = self.motion(theta)
-        inside = np.isfinite(log_volume) & np.isfinite(positions).all(axis=(-3, -2, -1))
+            inside = np.isfinite(log_measure) & np.isfinite(positions).all(axis=(-3, -2, -1))
+            log_prior = self.log_prior(positions[inside])
         log_density = np.full(inside.shape, -np.inf)
-        log_density[inside] = log_volume[inside] + self.log_prior(positions[inside])
-        return log_density
+        log_density[inside] = np.where(np.isnan(log_prior), -np.inf, log_prior)
+        return np.where(inside, log_measure, 0.0) + log_density
+
+    def log_measure(self, theta: Array) -> np.ndarray:
+        """Return the log density of θ for uniform positions: ``(…, dim) → (…)``."""
+        return self.physics.chart.log_volume(to_numpy(theta))
 
     def log_prior(self, positions: Array) -> np.ndarray:
         """Return log p(X | y), up to a constant: ``(…, 1, J, 3) → (…)``."""
@@ -141,9 +159,9 @@ class PhysicalLift:
             changes = np.log(lengths / given)
         return -0.5 * (changes**2).sum(axis=-1) / self.physics.bone_noise**2
 
-    def walks(self, likelihood: Likelihood | None) -> LiftWalks | None:
-        """Return walks over poses, or None with a likelihood."""
-        return LiftWalks(self) if likelihood is None else None
+    def walks(self, likelihood: Likelihood | None) -> LiftWalks:
+        """Return walks over poses; there is no likelihood."""
+        return LiftWalks(self)
 
     def _starts(self, rng: np.random.Generator, n: int) -> np.ndarray:
         poses = np.stack([valid_start(self.mixture, self.physics, rng) for _ in range(n)])
@@ -155,8 +173,8 @@ class PhysicalLift:
 class LiftWalks:
     """Compiled walks of :mod:`.physical_lifting_kernels`; see the protocol ``Walks``.
 
-    There is one "view", whose likelihood is a power of the density b(X) of the bone lengths, .85.
-    The other factors of p(X | y) are the prior.
+    There is one view, with likelihood b(X)^0.85. The prior is the rest of p(X | y), including
+    b(X)^0.15.
     """
 
     prior: PhysicalLift
@@ -170,8 +188,7 @@ class LiftWalks:
 
     @cached_property
     def _proposals(self) -> np.ndarray:
-        moves = moves_of(self.prior.physics.body)
-        return moves[moves[:, 0] != APPROACH]
+        return lift_moves(self.prior.physics.body)
 
     def terms(self, pose: np.ndarray) -> np.ndarray:
         """Return no terms: walks compute them anew."""

@@ -27,7 +27,7 @@ import numpy as np
 
 from probmotion import seeds
 from probmotion.interaction.annotations.annotations import Annotations
-from probmotion.models.pose_pairs.pair_moves import APPROACH, moves_of
+from probmotion.models.pose_pairs.pair_moves import APPROACH, Body, moves_of
 from probmotion.models.pose_pairs.pose_pairs import PosePairPrior
 from probmotion.models.unseen_depth.annotation_prior import AnnotationPrior, check_size
 from probmotion.models.unseen_depth.keypoints import (
@@ -41,8 +41,8 @@ from probmotion.threads import only_one_thread
 from probmotion.validation import check_count
 
 __all__ = [
-    "LEAST_POWER", "LiftMixture", "checked_keypoints", "lift_mixtures", "physical_lifts",
-    "valid_start",
+    "LEAST_POWER", "LiftMixture", "checked_keypoints", "lift_mixtures", "lift_moves",
+    "physical_lifts", "valid_start",
 ]  # fmt: skip
 
 LEAST_POWER = 0.15
@@ -102,8 +102,7 @@ def physical_lifts(
     check_count("warmup", warmup)
     check_count("sweeps", sweeps)
     images, centres = centred_images(checked_keypoints(annotations, prior, physics))
-    moves = moves_of(physics.body)
-    moves = moves[moves[:, 0] != APPROACH]
+    moves = lift_moves(physics.body)
     out = np.empty((draws, len(images), prior.n_joints, 3))
 
     def walk(mixture: LiftMixture) -> None:
@@ -139,12 +138,12 @@ def physical_lifts(
 def checked_keypoints(
     annotations: Annotations | np.ndarray, prior: AnnotationPrior, physics: PosePairPrior
 ) -> np.ndarray:
-    """Return the keypoints (n, J, 2) of annotations that have the joints and size of both priors.
+    """Return the keypoints (n, J, 2) of annotations.
 
     Raises
     ------
     ValueError
-        If they have not.
+        If their joints or scale, or the joints of the priors, differ.
     """
     if physics.skeleton.n_joints != prior.n_joints:
         raise ValueError(
@@ -180,6 +179,12 @@ class LiftMixture(NamedTuple):
         spread = self.spreads[self.cells[component]]
         flat = self.means[component] + spread @ rng.standard_normal(spread.shape[1])
         return np.ascontiguousarray(flat.reshape(3, -1).T)
+
+
+def lift_moves(body: Body) -> np.ndarray:
+    """Return the moves that need no annotations of a view; see :func:`.pair_moves.moves_of`."""
+    moves = moves_of(body)
+    return moves[moves[:, 0] != APPROACH]
 
 
 def valid_start(

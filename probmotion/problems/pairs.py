@@ -126,7 +126,7 @@ def _physical_lift() -> Problem:
     learnt = AnnotationPrior.load(Path(models.__file__).parent / "weights" / "salsa-pairs.npz")
     poses = ground_truth(training)[0]
     physics = PosePairPrior(poses[choose_seed(poses)], training[0].skeleton, training[0].fps)
-    # The pose in the middle of the held-out dance, in the axes of the camera.
+    # The middle frame of the held-out clips, in the axes of the camera.
     pose = ground_truth(test, 1)[0][0] @ world_axes(np.array([_VIEW]))[0].T
     pose = pose - pose.mean(axis=0)
     noise = learnt.noise * seeds.generator(0, "annotation").standard_normal((len(pose), 2))

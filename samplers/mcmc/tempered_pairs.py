@@ -11,8 +11,8 @@ Neighbouring levels exchange states (Swendsen and Wang 1986), alternating even a
 the powers are tuned to equal rejection rates (Syed et al. 2022). If the posterior density f is
 truncated to f* ≤ f (eq. 11), one more state targets f* and is exchanged with the state at power 1.
 
-Physical lifts of an annotation are sampled likewise: they have one view, whose likelihood is the
-density of the bone lengths.
+Physical lifts of an annotation are sampled likewise: they have one view, whose likelihood is a
+power of the density of the bone lengths.
 """
 
 from __future__ import annotations

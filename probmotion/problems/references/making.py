@@ -28,7 +28,7 @@ from probmotion.metrics.chains import chain_diagnostics, principal_coordinates
 from probmotion.metrics.distribution import random_directions
 from probmotion.posteriors.draws import MotionDraws, library_versions, settings_of
 from probmotion.posteriors.problem import Problem
-from probmotion.posteriors.protocols import HasSeeds, Samplable
+from probmotion.posteriors.protocols import HasLogDensity, HasWalks, Samplable
 from probmotion.posteriors.reference import StoredReference, fingerprint_of
 from probmotion.posteriors.sampling import Sampler, load_sampler
 from probmotion.problems.references.outlier_gibbs import OutlierGibbs
@@ -92,11 +92,8 @@ def make_reference(
     check_count("draws", draws, least=8 * _CHAINS)
     if draws % (2 * _CHAINS):
         raise ValueError(f"draws must be a multiple of {2 * _CHAINS}, got {draws}")
-    shape = (problem.posterior.frames, problem.posterior.skeleton.n_joints, 3)
-    # Compute the fingerprint first, so that unsupported posteriors fail before the long runs. Any
-    # points near the origin distinguish posteriors.
-    probes = 0.1 * seeds.generator(0, "unfinished").standard_normal((_PROBES, *shape))
-    fingerprint = fingerprint_of(problem.posterior, probes)
+    # Compute the fingerprint first, so that unsupported posteriors fail before the long runs.
+    fingerprint = fingerprint_of(problem.posterior, _probes(problem))
     if problem.exact_source is not None:
         sampler = load_sampler("exact")()
     elif sampler is None:
@@ -109,6 +106,16 @@ def make_reference(
         make = partial(_run, problem, sampler, n, seed, half, progress)
         runs.append(make(None) if folder is None else _cached_run(folder, half, key, make))
     return certify(problem, runs, seed, draws)
+
+
+def _probes(problem: Problem) -> np.ndarray:
+    """Return motions at which log densities distinguish posteriors."""
+    posterior, rng = problem.posterior, seeds.generator(0, "unfinished")
+    if isinstance(posterior.prior, HasLogDensity):
+        return to_numpy(posterior.prior.motion(posterior.prior.initial(rng, _PROBES)))
+    # Motions near the origin, since there are no others.
+    shape = (_PROBES, posterior.frames, posterior.skeleton.n_joints, 3)
+    return 0.1 * rng.standard_normal(shape)
 
 
 def _default_sampler(problem: Problem) -> Sampler:
@@ -212,7 +219,7 @@ def certify(
         "draws_made": sum(len(run.flat()) for run in runs),
         "chains": len(runs) * runs[0].dataset.sizes["chain"],
         # None if chains start at draws from the prior.
-        "seeds": len(prior.seed_coordinates()) if isinstance(prior, HasSeeds) else None,
+        "seeds": len(prior.seed) if isinstance(prior, HasWalks) else None,
         "rhat": max(rhats, default=None),
         "ess_bulk": _minimum(diagnostics, "ess_bulk"),
         "ess_tail": _minimum(diagnostics, "ess_tail"),

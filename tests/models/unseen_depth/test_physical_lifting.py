@@ -21,7 +21,6 @@ from probmotion.models.pose_pairs.pair_moves import (
     SLIDE,
     SWING,
     TURN,
-    moves_of,
     propose,
 )
 from probmotion.models.unseen_depth import (
@@ -33,9 +32,10 @@ from probmotion.models.unseen_depth import (
 from probmotion.models.unseen_depth.keypoints import centred_images
 from probmotion.models.unseen_depth.physical_lifting import physical_lifts
 from probmotion.motion.skeleton import Skeleton
+from probmotion.posteriors.truncation import TruncatedPosterior
 from probmotion.samplers import TemperedPairs
 from probmotion.threads import one_thread
-from tests.models.pose_pairs.small_dances import z_scores
+from tests.models.pose_pairs.small_dances import small_likelihood, z_scores
 
 SKELETON = Skeleton.preset("pair17")
 
@@ -150,7 +150,11 @@ def summaries(poses, physics):
 def test_powers_of_walks_are_those_of_the_likelihood(prior, keypoints, pose, monkeypatch):
     """The least power is part of the prior, and walks at power 1 target the density."""
     kept = []
-    monkeypatch.setattr(physical_lift, "walk_replica", lambda *given: kept.append(given[5]))
+
+    def watched(pose, log_weights, means, cells, roots, power, *others):
+        kept.append(power)
+
+    monkeypatch.setattr(physical_lift, "walk_replica", watched)
     lift = PhysicalLift(prior, keypoints[0], PosePairPrior(pose, SKELETON))
     walks, powers = lift.walks(None), np.array([0.0, 0.4, 1.0])
     sizes, counts = np.ones(len(walks.moves)), np.zeros((2, len(walks.moves)))
@@ -164,8 +168,11 @@ def test_powers_of_walks_are_those_of_the_likelihood(prior, keypoints, pose, mon
     assert kept[-1] == pytest.approx(1.0)
 
 
-def test_density_is_that_of_the_mixture_and_the_physical_prior(prior, keypoints, pose):
-    lift = PhysicalLift(prior, keypoints[0], PosePairPrior(pose, SKELETON), depth_sd=0.1)
+@pytest.mark.parametrize("hidden", [[], [8, 20]], ids=["visible", "missing"])
+def test_density_is_that_of_the_mixture_and_the_physical_prior(prior, keypoints, pose, hidden):
+    annotation = keypoints[0].copy()
+    annotation[hidden] = np.nan
+    lift = PhysicalLift(prior, annotation, PosePairPrior(pose, SKELETON), depth_sd=0.1)
     poses, mixture = lift.seed, lift.mixture
     flat = np.swapaxes(poses, 1, 2).reshape(len(poses), -1)
     in_depth = np.repeat([0.0, 0.0, 1.0], 34)
@@ -180,8 +187,24 @@ def test_density_is_that_of_the_mixture_and_the_physical_prior(prior, keypoints,
     theta = lift.physics.coordinates(poses)
     log_volume = lift.physics.chart.log_volume(theta)
     np.testing.assert_allclose(lift.log_density(theta) - log_volume, lift.log_prior(poses[:, None]))
-    theta[:-1, 0], theta[-1, 14::3] = 4.0, 800.0  # rotations beyond π, infinite bones
-    assert (lift.log_density(theta) == -np.inf).all()
+    # A rotation beyond π, and lengths of which the squares, or themselves, are infinite.
+    theta[0, 0], theta[1, 14::3], theta[2, 14::3] = 4.0, 400.0, 800.0
+    assert (lift.log_density(theta[:3]) == -np.inf).all()
+
+
+def test_truncated_lifts_are_within_the_bounds(prior, keypoints, pose):
+    lift = PhysicalLift(prior, keypoints[0], PosePairPrior(pose, SKELETON))
+    sampler = TemperedPairs(levels=3, steps=100, warmup=64, thin=4)
+    poses = sampler.sample(MotionPosterior(lift), draws=20, progress=False).positions.values[0]
+    log_densities = lift.log_prior(poses)
+    middle = np.argsort(log_densities)[10]
+    seed = lift.physics.coordinates(poses[middle, 0])
+    posterior = TruncatedPosterior(lift, seed=seed, limit=np.exp(5.0))
+    assert posterior.log_seed == pytest.approx(log_densities[middle])
+    run = sampler.sample(posterior, draws=20, progress=False)
+    log_densities = lift.log_prior(run.positions.values[0])
+    assert (log_densities > posterior.log_floor).all()
+    assert len(np.unique(log_densities)) > 5
 
 
 def test_draws_have_the_bones_of_the_people_and_keep_to_the_image(prior, keypoints, pose):
@@ -241,8 +264,8 @@ def test_swaps_have_the_densities_of_the_replicas(prior, keypoints, pose):
     physics = PosePairPrior(pose, SKELETON)
     [[mixture]] = physical.lift_mixtures(prior, centred_images(keypoints[:1])[0])
     given = mixture.log_weights, mixture.means, mixture.cells, mixture.roots
-    moves, rigid = moves_of(physics.body), np.full((2, 2, APPROACH), -60.0)
-    moves, powers = moves[moves[:, 0] != APPROACH], np.array([0.2, 1.0])
+    moves, powers = physical.lift_moves(physics.body), np.array([0.2, 1.0])
+    rigid = np.full((2, 2, APPROACH), -60.0)
     longer, rng = 1.02 * pose, np.random.default_rng(0)
     poses, cold = np.stack([pose, longer]), []
     for _ in range(1500):
@@ -273,6 +296,10 @@ def test_wrong_input(prior, keypoints, pose):
             function(other, given, physics)
     with pytest.raises(ValueError, match="depth_sd must be"):
         PhysicalLift(prior, keypoints[0], physics, depth_sd=0.0)
+    with pytest.raises(ValueError, match=r"keypoints must have shape \(J, 2\)"):
+        PhysicalLift(prior, keypoints[:1], physics)
+    with pytest.raises(ValueError, match="likelihood must be None, since the annotation"):
+        MotionPosterior(PhysicalLift(prior, keypoints[0], physics), small_likelihood())
     with pytest.raises(ValueError, match=r"scale of the people, .* multiply them by lift\("):
         physical_lifts(prior, 200 * keypoints, physics)
     with pytest.raises(ValueError, match="must have variances of at least 1e-09 of the largest"):
