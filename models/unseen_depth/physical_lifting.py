@@ -79,7 +79,7 @@ def physical_lifts(
         Number of states of each annotation's chain.
     warmup : int
         Number of sweeps that tune step sizes. A sweep is 50 Metropolis steps of each of six
-        replicas, 1.5 to 3 ms.
+        replicas, 1 to 3 ms.
     sweeps : int
         Number of sweeps before each draw.
     seed : int
