@@ -13,8 +13,10 @@ from probmotion.metrics.coverage import coverage
 from probmotion.metrics.measures import measure
 from probmotion.models.unseen_depth import physical_lifts
 from probmotion.posteriors.problem import Problem
+from probmotion.posteriors.reference import fingerprint_of
 from probmotion.posteriors.truncation import TruncatedPosterior
 from probmotion.problems import load_problem, pairs_problem, problem_descriptions, problem_names
+from probmotion.problems.references import making
 from probmotion.samplers import MetropolisHastings, TemperedPairs
 from probmotion.samplers.mcmc.proposals import Isotropic
 
@@ -62,6 +64,11 @@ def test_lifted_annotation_is_of_the_truth(lifted):
     log_density = lift.log_prior(lifted.stored.positions.astype(float))
     z = (lift.log_prior(lifted.truth) - log_density.mean()) / log_density.std()
     assert abs(z) < 6
+
+
+def test_unfinished_references_of_lifts_are_told_apart(lifted):
+    """The density of a physical lift is 0 at random motions."""
+    assert np.isfinite(fingerprint_of(lifted.posterior, making._probes(lifted))).all()
 
 
 @pytest.mark.slow

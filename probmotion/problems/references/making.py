@@ -112,7 +112,7 @@ def _probes(problem: Problem) -> np.ndarray:
     """Return motions at which log densities distinguish posteriors."""
     posterior, rng = problem.posterior, seeds.generator(0, "unfinished")
     if isinstance(posterior.prior, HasLogDensity):
-        return to_numpy(posterior.prior.motion(posterior.prior.initial(rng, _PROBES)))
+        return posterior.complete(posterior.initial(rng, _PROBES))
     # Motions near the origin, since there are no others.
     shape = (_PROBES, posterior.frames, posterior.skeleton.n_joints, 3)
     return 0.1 * rng.standard_normal(shape)
