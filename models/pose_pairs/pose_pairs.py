@@ -121,6 +121,10 @@ class PosePairPrior:
 
     def log_density(self, theta: Array) -> np.ndarray:
         """Return log f(Θ) plus the log base measure, up to a constant: ``(…, dim) → (…)``."""
+        return self.density_and_motion(theta)[0]
+
+    def density_and_motion(self, theta: Array) -> tuple[np.ndarray, np.ndarray]:
+        """Return :meth:`log_density` and :meth:`motion`, ``(…, dim) → (…), (…, 1, J, 3)``."""
         theta = to_numpy(theta)
         log_measure = self.log_measure(theta)
         flat = theta.reshape(-1, self.dim)
@@ -131,7 +135,8 @@ class PosePairPrior:
         log_f = np.full(len(flat), -np.inf)
         log_f[inside] = self.log_plausibility(positions[inside])
         shaped = log_f.reshape(log_measure.shape)
-        return np.where(shaped > -np.inf, log_measure, 0.0) + shaped
+        log_density = np.where(shaped > -np.inf, log_measure, 0.0) + shaped
+        return log_density, positions.reshape(*theta.shape[:-1], *positions.shape[1:])
 
     def log_measure(self, theta: Array) -> np.ndarray:
         """Return the log base measure: ``(…, dim) → (…)``."""

@@ -16,6 +16,7 @@ from probmotion.posteriors.protocols import (
     HasConditional,
     HasCoordinateSpeeds,
     HasLogDensity,
+    HasMotionDensity,
     Likelihood,
     Marginalises,
     MotionPrior,
@@ -138,17 +139,20 @@ class MotionPosterior:
         likelihood is only evaluated where the prior's density is positive.
         """
         check_shape("theta", theta, ("…", self.dim))
-        if not isinstance(self.prior, HasLogDensity):
-            raise ValueError(f"prior must have a log density, got {type(self.prior).__name__}")
-        log_prior = self.prior.log_density(theta)
+        log_prior, motion = self._log_prior(theta)
         if not isinstance(log_prior, np.ndarray | np.floating):
             # Boolean masks fail under automatic differentiation and compilation.
             return log_prior if self.likelihood is None else log_prior + self.log_likelihood(theta)
-        if self.likelihood is None:
+        likelihood = self.likelihood
+        if likelihood is None:
             return self._shaped(np.asarray(log_prior), self._log_measure(theta))
 
         def evaluate(mask: np.ndarray) -> tuple[Array, np.ndarray]:
-            return self.log_likelihood(theta[mask]), np.empty((mask.sum(), 0), dtype=int)
+            if motion is None:
+                log_likelihood = self.log_likelihood(theta[mask])
+            else:
+                log_likelihood = likelihood.log_density(motion[mask])
+            return log_likelihood, np.empty((mask.sum(), 0), dtype=int)
 
         return self._with_observations(theta, np.asarray(log_prior), evaluate)[0]
 
@@ -181,13 +185,14 @@ class MotionPosterior:
                 "limit must be infinite with randomly drawn views, since truncating an unbiased "
                 "estimate biases it"
             )
-        log_prior = to_numpy(self.prior.log_density(theta))
+        log_prior, motion = self._log_prior(theta)
 
         def compare(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             selected = None if generators is None else [generators[i] for i in np.flatnonzero(mask)]
-            return likelihood.evaluate(to_numpy(self.prior.motion(theta[mask])), selected)
+            positions = self.prior.motion(theta[mask]) if motion is None else motion[mask]
+            return likelihood.evaluate(to_numpy(positions), selected)
 
-        return self._with_observations(theta, log_prior, compare)
+        return self._with_observations(theta, to_numpy(log_prior), compare)
 
     def draw_statistics(self, theta: np.ndarray, log_density: np.ndarray) -> dict[str, np.ndarray]:
         """Return additional statistics of draws by name, given θ (…, dim) and log density (…)."""
@@ -206,6 +211,14 @@ class MotionPosterior:
                 f"{type(self.prior).__name__} and {type(self.likelihood).__name__}"
             )
         return self.prior.coordinate_speeds(self.likelihood.joint_speeds(closest))
+
+    def _log_prior(self, theta: Array) -> tuple[Array, Array | None]:
+        """Return log p(θ) and, if the prior computes it from the motion, that motion."""
+        if isinstance(self.prior, HasMotionDensity):
+            return self.prior.density_and_motion(theta)
+        if not isinstance(self.prior, HasLogDensity):
+            raise ValueError(f"prior must have a log density, got {type(self.prior).__name__}")
+        return self.prior.log_density(theta), None
 
     def _with_observations(
         self,

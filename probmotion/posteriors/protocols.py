@@ -31,6 +31,7 @@ __all__ = [
     "HasInferenceNetwork",
     "HasLogDensity",
     "HasManifold",
+    "HasMotionDensity",
     "HasSeeds",
     "HasStyles",
     "HasWalks",
@@ -125,6 +126,14 @@ class HasLogDensity(Protocol):
 
     def initial(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """Return n initial points, (n, dim): seeds of a `HasSeeds` prior, else draws."""
+
+
+@runtime_checkable
+class HasMotionDensity(HasLogDensity, Protocol):
+    """A prior whose log density is computed from the motion, which the likelihood needs too."""
+
+    def density_and_motion(self, theta: Array) -> tuple[Array, Array]:
+        """Return log p(θ) and the motion: ``(…, dim) → (…), (…, L, J, 3)``."""
 
 
 @runtime_checkable

@@ -49,7 +49,7 @@ class TruncatedPosterior(MotionPosterior):
         log_density = float(untruncated.log_density(theta[None])[0])
         if not math.isfinite(log_density):
             raise ValueError(f"seed must have positive density, got log density {log_density}")
-        log_seed = log_density - float(self._log_measure(theta[None])[0])
+        log_seed = log_density - float(self._log_measure_of_prior(theta[None])[0])
         object.__setattr__(self, "log_seed", log_seed)
 
     @property
@@ -77,6 +77,10 @@ class TruncatedPosterior(MotionPosterior):
         }
 
     def _log_measure(self, theta: Array) -> np.ndarray:
+        # Only bounds depend on it.
+        return self._log_measure_of_prior(theta) if self.truncated else super()._log_measure(theta)
+
+    def _log_measure_of_prior(self, theta: Array) -> np.ndarray:
         measure = getattr(self.prior, "log_measure", None)
         return super()._log_measure(theta) if measure is None else measure(theta)
 

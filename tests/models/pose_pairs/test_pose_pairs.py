@@ -8,14 +8,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from probmotion import MotionPosterior
 from probmotion.data.pair_sets import choose_seed
 from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.interaction.annotations.sources import draw_annotations
 from probmotion.models.pose_pairs.joint_limits import JointLimits
 from probmotion.models.pose_pairs.pair_posterior import PairSettings, pair_posterior
 from probmotion.models.pose_pairs.penetration import penetration_depth
+from probmotion.models.pose_pairs.pose_chart import PoseChart
 from probmotion.models.pose_pairs.pose_pairs import PosePairPrior
 from probmotion.motion.skeleton import Skeleton
+from tests.models.pose_pairs.small_dances import small_likelihood
 
 PAIR = Skeleton.preset("pair17")
 DANCES = synthetic_dances(3)
@@ -58,6 +61,23 @@ def test_density_equals_equation_2(prior):
     theta[:2] = 0
     theta[0], theta[1, -1] = 1e5, 1e5  # bone lengths overflow
     assert np.isneginf(prior.log_density(theta)[:2]).all()
+
+
+def test_posterior_computes_each_pose_once(prior, monkeypatch):
+    likelihood = small_likelihood()
+    theta = prior.initial(np.random.default_rng(0), 5)
+    expected = prior.log_density(theta) + likelihood.log_density(prior.motion(theta))
+    computed, positions = [], PoseChart.positions
+
+    def counted(chart, points):
+        computed.append(len(points))
+        return positions(chart, points)
+
+    monkeypatch.setattr(PoseChart, "positions", counted)
+    posterior = MotionPosterior(prior, likelihood)
+    np.testing.assert_allclose(posterior.log_density(theta), expected)
+    np.testing.assert_allclose(posterior.evaluate(theta)[0], expected)
+    assert computed == [5, 5]
 
 
 def test_plausibility_separates_real_and_broken_poses_and_is_rigidly_invariant(prior):
