@@ -19,8 +19,10 @@ from .protocols import (
     HasInferenceNetwork as HasInferenceNetwork,
     HasLogDensity as HasLogDensity,
     HasManifold as HasManifold,
+    HasMotionDensity as HasMotionDensity,
     HasSeeds as HasSeeds,
     HasStyles as HasStyles,
+    HasWalks as HasWalks,
     InferenceNetwork as InferenceNetwork,
     Likelihood as Likelihood,
     Marginalises as Marginalises,
@@ -29,6 +31,7 @@ from .protocols import (
     NotConjugate as NotConjugate,
     OrthographicOnly as OrthographicOnly,
     Samplable as Samplable,
+    Walks as Walks,
 )
 from .reference import StoredReference as StoredReference
 from .sampling import (
