@@ -24,11 +24,13 @@ from probmotion.models.unseen_depth.physical_lifting import (
 from probmotion.models.unseen_depth.physical_lifting_kernels import walk_replica
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.protocols import Likelihood
-from probmotion.validation import check_positive, check_shape
+from probmotion.validation import check_shape
 
-__all__ = ["LiftWalks", "PhysicalLift"]
+__all__ = ["DEPTH_SD", "LiftWalks", "PhysicalLift"]
 
 _STARTS = 4  # of walks, as many as chains by default
+DEPTH_SD = 0.05
+"""Standard deviation of the mean depth, metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +38,8 @@ class PhysicalLift:
     """p(X | y) of :mod:`.physical_lifting` for one annotation y, with a density of the mean depth.
 
     θ are the coordinates of ``physics.chart``. Positions are in the axes of the camera, x and y in
-    place; the mean depth of the joints, which an image does not show, is normal. The annotation is
-    part of this prior: its posterior has no likelihood.
+    place; the mean depth of the joints, which an image does not show, is normal (sd 5 cm). The
+    annotation is part of this prior: its posterior has no likelihood.
 
     Parameters
     ----------
@@ -49,26 +51,22 @@ class PhysicalLift:
     physics : PosePairPrior
         Physical prior with the bone lengths of the people. Its density of root positions is not
         used.
-    depth_sd : float
-        Standard deviation of the mean depth, metres.
 
     Raises
     ------
     ValueError
-        As :func:`~.physical_lifting.physical_lifts`, or if ``depth_sd`` is not positive.
+        As :func:`~.physical_lifting.physical_lifts`.
     """
 
     learnt: AnnotationPrior
     keypoints: np.ndarray
     physics: PosePairPrior
-    depth_sd: float = 0.05
     mixture: LiftMixture = field(init=False, repr=False)
 
     frames = 1
     differentiable = False
 
     def __post_init__(self) -> None:
-        check_positive("depth_sd", self.depth_sd)
         keypoints = np.array(self.keypoints, dtype=np.float64)
         check_shape("keypoints", keypoints, ("J", 2))
         images, [centre] = centred_images(
@@ -143,7 +141,7 @@ class PhysicalLift:
         ):
             white = (flat - mean) @ self.mixture.roots[cell]
             logs.append(log_weight - 0.5 * (white**2).sum(axis=-1))
-        depth = poses[..., 2].mean(axis=-1) / self.depth_sd
+        depth = poses[..., 2].mean(axis=-1) / DEPTH_SD
         log_gaussian = logsumexp(np.stack(logs, axis=-1), axis=-1) - 0.5 * depth**2
         return log_gaussian + self.log_bones(poses) + self.physics.log_plausibility(positions)
 
@@ -165,7 +163,7 @@ class PhysicalLift:
 
     def _starts(self, rng: np.random.Generator, n: int) -> np.ndarray:
         poses = np.stack([valid_start(self.mixture, self.physics, rng) for _ in range(n)])
-        poses[..., 2] += self.depth_sd * rng.standard_normal((n, 1))
+        poses[..., 2] += DEPTH_SD * rng.standard_normal((n, 1))
         return poses
 
 
@@ -222,5 +220,5 @@ class LiftWalks:
             self._proposals, sizes.reshape(shape), tried.reshape(shape), taken.reshape(shape),
             physics.body, physics.physics, rng,
         )  # fmt: skip
-        pose[:, 2] += self.prior.depth_sd * rng.standard_normal() - pose[:, 2].mean()
+        pose[:, 2] += DEPTH_SD * rng.standard_normal() - pose[:, 2].mean()
         return 0, self.log_view(pose, 0)

@@ -1,8 +1,7 @@
 """Measurements of every sampler on every problem, shipped with the package.
 
 ``measured.csv`` contains the metrics that ``advise`` uses, ``measured.json`` the settings,
-problem descriptions and reasons for missing values, and ``longer.csv`` results of 200 draws, most
-of them with larger budgets.
+problem descriptions and reasons for missing values, and ``longer.csv`` results with larger budgets.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ _DIGITS = 5  # significant digits of stored values
 
 
 class LongerRun(NamedTuple):
-    """Result of a sampler with another budget.
+    """Result of a sampler with a larger budget.
 
     ``seconds`` is the budget of a run, ``swd_ratio`` the mean over seeds, and ``right`` whether the
     verdict on all seeds is "right".
@@ -79,7 +78,7 @@ class Measured:
     words : dict of str
         One-word reason for missing draws, by ``problem/sampler``.
     longer : tuple of LongerRun
-        Results with other budgets.
+        Results with larger budgets.
     """
 
     rows: pd.DataFrame
@@ -120,7 +119,7 @@ def save_measurements(comparison: Comparison, command: str, folder: str | Path =
 
 
 def save_longer(runs: Sequence[LongerRun], folder: str | Path = _FOLDER) -> None:
-    """Write results with other budgets, by default to the shipped file ``longer.csv``."""
+    """Write results with larger budgets, by default to the shipped file ``longer.csv``."""
     import pandas as pd
 
     table = pd.DataFrame(runs, columns=list(LongerRun._fields))

@@ -12,6 +12,7 @@ from probmotion.data.synthetic.dances import synthetic_dances
 from probmotion.metrics.coverage import coverage
 from probmotion.metrics.measures import measure
 from probmotion.models.unseen_depth import physical_lifts
+from probmotion.models.unseen_depth.physical_lift import DEPTH_SD
 from probmotion.posteriors.problem import Problem
 from probmotion.posteriors.reference import fingerprint_of
 from probmotion.posteriors.truncation import TruncatedPosterior
@@ -66,9 +67,18 @@ def test_lifted_annotation_is_of_the_truth(lifted):
     assert abs(z) < 6
 
 
-def test_unfinished_references_of_lifts_are_told_apart(lifted):
-    """The density of a physical lift is 0 at random motions."""
-    assert np.isfinite(fingerprint_of(lifted.posterior, making._probes(lifted))).all()
+def test_unfinished_references_of_lifts_are_told_apart(lifted, monkeypatch):
+    """The density of a physical lift is 0 at random motions, which identify no lift."""
+    kept = []
+
+    def watched(posterior, probes):
+        kept.extend(fingerprint_of(posterior, probes))
+        raise InterruptedError
+
+    monkeypatch.setattr(making, "fingerprint_of", watched)
+    with pytest.raises(InterruptedError):
+        making.make_reference(lifted)
+    assert np.isfinite(kept).all()
 
 
 @pytest.mark.slow
@@ -80,7 +90,7 @@ def test_physical_lifts_agree_with_the_reference(lifted):
     wrong = lift.learnt.sample_lifts(annotations, rng, 1)[0]  # without the physical prior
     verdicts = []
     for poses in (right, wrong):
-        poses[..., 2] += lift.depth_sd * rng.standard_normal((200, 1))
+        poses[..., 2] += DEPTH_SD * rng.standard_normal((200, 1))
         draws = MotionDraws.of(
             lifted.posterior, TemperedPairs(), poses[None, :, None], seed=0, seconds=1.0,
             independent=True,

@@ -30,6 +30,7 @@ from probmotion.models.unseen_depth import (
     physical_lifting as physical,
 )
 from probmotion.models.unseen_depth.keypoints import centred_images
+from probmotion.models.unseen_depth.physical_lift import DEPTH_SD
 from probmotion.models.unseen_depth.physical_lifting import physical_lifts
 from probmotion.motion.skeleton import Skeleton
 from probmotion.posteriors.truncation import TruncatedPosterior
@@ -114,12 +115,12 @@ def test_tempered_draws_match_importance_weighted_lifts(prior, keypoints, pose):
     physics = PosePairPrior(
         pose, SKELETON, max_invalid=99, penetration_weight=30.0, bone_noise=0.6, position_noise=0.3
     )
-    lift = PhysicalLift(prior, keypoints[0], physics, depth_sd=0.1)
+    lift = PhysicalLift(prior, keypoints[0], physics)
     sampler = TemperedPairs(levels=3, steps=100, warmup=64, thin=4)
     run = sampler.sample(MotionPosterior(lift), draws=150, chains=4, progress=False)
     poses = run.positions.values[:, :, 0]
     depths = poses[..., 2].mean(axis=-1)
-    assert depths.std() == pytest.approx(0.1, rel=0.15)
+    assert depths.std() == pytest.approx(DEPTH_SD, rel=0.15)
     poses[..., 2] -= depths[..., None]
     exact, weights = weighted_lifts(prior, keypoints[:1], physics)
     expected = summaries(exact, physics)
@@ -172,14 +173,14 @@ def test_powers_of_walks_are_those_of_the_likelihood(prior, keypoints, pose, mon
 def test_density_is_that_of_the_mixture_and_the_physical_prior(prior, keypoints, pose, hidden):
     annotation = keypoints[0].copy()
     annotation[hidden] = np.nan
-    lift = PhysicalLift(prior, annotation, PosePairPrior(pose, SKELETON), depth_sd=0.1)
+    lift = PhysicalLift(prior, annotation, PosePairPrior(pose, SKELETON))
     poses, mixture = lift.seed, lift.mixture
     flat = np.swapaxes(poses, 1, 2).reshape(len(poses), -1)
     in_depth = np.repeat([0.0, 0.0, 1.0], 34)
     logs = []
     for weight, mean, cell in zip(mixture.weights, mixture.means, mixture.cells, strict=True):
         spread = mixture.spreads[cell]
-        covariance = spread @ spread.T + 0.1**2 * np.outer(in_depth, in_depth)
+        covariance = spread @ spread.T + DEPTH_SD**2 * np.outer(in_depth, in_depth)
         logs.append(np.log(weight) + multivariate_normal(mean, covariance).logpdf(flat))
     expected = logsumexp(logs, axis=0) + lift.physics.log_plausibility(poses[:, None])
     expected -= 0.5 * (log_lengths(poses, pose) ** 2).sum(axis=-1) / lift.physics.bone_noise**2
@@ -294,8 +295,6 @@ def test_wrong_input(prior, keypoints, pose):
     for function, given in ((physical_lifts, keypoints[:, 1:]), (PhysicalLift, keypoints[0, 1:])):
         with pytest.raises(ValueError, match="physics must have the prior's 33 joints, got 34"):
             function(other, given, physics)
-    with pytest.raises(ValueError, match="depth_sd must be"):
-        PhysicalLift(prior, keypoints[0], physics, depth_sd=0.0)
     with pytest.raises(ValueError, match=r"keypoints must have shape \(J, 2\)"):
         PhysicalLift(prior, keypoints[:1], physics)
     with pytest.raises(ValueError, match="likelihood must be None, since the annotation"):
