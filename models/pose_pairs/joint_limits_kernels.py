@@ -31,7 +31,7 @@ from probmotion.models.pose_pairs.joint_limits_frames import (
 from probmotion.motion.skeleton import Skeleton
 
 __all__ = [
-    "PARTS", "Corrections", "LimitArrays", "correct_person", "corrections", "local_directions",
+    "PARTS", "Corrections", "LimitArrays", "check_person", "corrections", "local_directions",
     "project_poses",
 ]  # fmt: skip
 
@@ -62,12 +62,17 @@ class LimitArrays(NamedTuple):
 
 
 class Corrections(NamedTuple):
-    """Bones of one person, by end joint, before and after a traversal."""
+    """Bones of one person, by end joint, before and after a traversal.
+
+    The next traversal, with equal limits, only checks bones whose ``checked`` or parent's direction
+    has changed.
+    """
 
     given: np.ndarray  # (17, 3), unit vectors
     directions: np.ndarray  # (17, 3), unit vectors after correction
     valid: np.ndarray  # (17,), bool
     local: np.ndarray  # (17, 2, 3), directions of the parent and the bone in the bone's frame
+    checked: np.ndarray  # (17, 3), direction of the bone in its frame before correction
     shifts: np.ndarray  # (17, 3), displacements of the joints, metres
 
 
@@ -148,21 +153,24 @@ def _check(part: int, joint: int, last: int, frame: Frame, condition: Vector, wa
 
     A bone of length 0 is valid and gets its mean direction.
     """
-    limits, correct, (_, directions, valid, local, _) = walk
+    limits, correct, (_, directions, valid, local, checked, _) = walk
     direction = row_of(directions, joint)
-    valid[joint] = True
-    if direction == NO_LENGTH:
-        u = row_of(limits.rest, part)
+    u = in_frame(frame, direction)
+    if u != row_of(checked, joint) or condition != row_of(local[joint], 0):
+        _set_row(checked, joint, u)
+        _set_row(local[joint], 0, condition)
+        valid[joint] = True
+        if direction == NO_LENGTH:
+            u = row_of(limits.rest, part)
+        else:
+            row = cell_of(condition, limits.bin_rings)
+            valid[joint] = limits.allowed[part, row, cell_of(u, limits.cell_rings)]
+            if correct and not valid[joint]:
+                u = _nearest_allowed(u, part, row, limits)
+        _set_row(local[joint], 1, u)
+    u = row_of(local[joint], 1)
+    if direction == NO_LENGTH or (correct and not valid[joint]):
         _rotate_bone(directions, joint, from_frame(frame, u), last)
-    else:
-        u = in_frame(frame, direction)
-        row = cell_of(condition, limits.bin_rings)
-        valid[joint] = limits.allowed[part, row, cell_of(u, limits.cell_rings)]
-        if correct and not valid[joint]:
-            u = _nearest_allowed(u, part, row, limits)
-            _rotate_bone(directions, joint, from_frame(frame, u), last)
-    _set_row(local[joint], 0, condition)
-    _set_row(local[joint], 1, u)
     return u
 
 
@@ -173,7 +181,7 @@ def _walk_person(walk: Walk) -> None:
     ``local`` receives the directions of each parent and bone. Frames depend only on bones already
     corrected, and corrections do not change frames already used, so the result is valid.
     """
-    limits, correct, (_, directions, valid, local, _) = walk
+    limits, correct, (_, directions, valid, local, _, _) = walk
     pelvis = line_frame(
         row_of(directions, LEFT_HIP), row_of(directions, RIGHT_HIP), row_of(directions, SPINE)
     )
@@ -216,7 +224,7 @@ def _walk_person(walk: Walk) -> None:
 @numba.njit(**NO_ALLOCATION)
 def _check_spine(pelvis: Frame, walk: Walk) -> Vector:
     """Check the tilt of the spine in the left-up plane of the pelvis and return its direction."""
-    limits, correct, (_, directions, valid, local, _) = walk
+    limits, correct, (_, directions, valid, local, _, _) = walk
     if row_of(directions, SPINE) == NO_LENGTH:
         _set_row(directions, SPINE, pelvis[1])
     u = in_frame(pelvis, row_of(directions, SPINE))
@@ -256,26 +264,39 @@ def project_poses(
     ``trees`` (K, 17) contains the joints of each person in the order of ``person17``.
     """
     nearest, valid = poses.copy(), np.ones(poses.shape[:2], dtype=np.bool_)
-    bones = corrections()
+    bones = corrections(1)
     for pose in range(len(poses)):
         for tree in trees:
-            correct_person(poses[pose], tree, limits, bones)
+            check_person(poses[pose], 0, tree, limits, True, bones)
             for joint in range(1, N_JOINTS):
-                valid[pose, tree[joint]] = bones.valid[joint]
+                valid[pose, tree[joint]] = bones.valid[0, joint]
                 for i in range(3):
-                    nearest[pose, tree[joint], i] += bones.shifts[joint, i]
+                    nearest[pose, tree[joint], i] += bones.shifts[0, joint, i]
     return valid, nearest
 
 
 @numba.njit(**NO_ALLOCATION)
-def correct_person(
-    pose: np.ndarray, tree: np.ndarray, limits: LimitArrays, bones: Corrections
+def check_person(
+    pose: np.ndarray,
+    person: int,
+    tree: np.ndarray,
+    limits: LimitArrays,
+    correct: bool,
+    bones: Corrections,
 ) -> None:
     """Write the bones of a person and the displacements to a nearby valid pose to ``bones``."""
-    given, directions, _, _, shifts = bones
+    own = Corrections(
+        bones.given[person],
+        bones.directions[person],
+        bones.valid[person],
+        bones.local[person],
+        bones.checked[person],
+        bones.shifts[person],
+    )
+    given, directions, shifts = own.given, own.directions, own.shifts
     _directions(pose, tree, given)
     overwrite(directions, given)
-    _walk_person(Walk(limits, True, bones))
+    _walk_person(Walk(limits, correct, own))
     for joint in range(1, N_JOINTS):
         parent = _PARENTS[joint]
         length = length_of(between(pose, tree[parent], tree[joint]))
@@ -286,20 +307,19 @@ def correct_person(
 
 
 @numba.njit(cache=True)
-def corrections() -> Corrections:
-    """Return arrays that :func:`correct_person` overwrites."""
-    vectors = np.zeros((3, N_JOINTS, 3))
-    valid, local = np.ones(N_JOINTS, dtype=np.bool_), np.zeros((N_JOINTS, 2, 3))
-    return Corrections(vectors[0], vectors[1], valid, local, vectors[2])
+def corrections(people: int) -> Corrections:
+    """Return arrays for several people, (K, …), which :func:`check_person` overwrites."""
+    vectors = np.zeros((4, people, N_JOINTS, 3))
+    valid, local = np.ones((people, N_JOINTS), dtype=np.bool_), np.zeros((people, N_JOINTS, 2, 3))
+    return Corrections(vectors[0], vectors[1], valid, local, vectors[2], vectors[3])
 
 
 @numba.njit(cache=True)
 def local_directions(poses: np.ndarray, limits: LimitArrays) -> np.ndarray:
     """Return the parent's and the bone's direction in each bone's frame, (n, 17, 2, 3)."""
-    local, bones = np.empty((len(poses), N_JOINTS, 2, 3)), corrections()
+    local, bones = np.empty((len(poses), N_JOINTS, 2, 3)), corrections(1)
     tree = np.arange(N_JOINTS)
     for pose in range(len(poses)):
-        _directions(poses[pose], tree, bones.directions)
-        _walk_person(Walk(limits, False, bones))
-        local[pose] = bones.local
+        check_person(poses[pose], 0, tree, limits, False, bones)
+        local[pose] = bones.local[0]
     return local

@@ -26,7 +26,7 @@ from probmotion.models.pose_pairs.joint_limits_frames import (
 from probmotion.models.pose_pairs.joint_limits_kernels import (
     Corrections,
     LimitArrays,
-    correct_person,
+    check_person,
     corrections,
 )
 from probmotion.models.pose_pairs.pair_moves import Body, log_root_positions
@@ -69,7 +69,7 @@ class Workspace(NamedTuple):
 
     pose: np.ndarray  # (J, 3), a proposal
     parts: np.ndarray  # (2 + 2 K,), terms of its log prior
-    bones: Corrections
+    bones: Corrections  # of K people
     spheres: np.ndarray  # (bones, 4), of capsules
     image: np.ndarray  # (2, J)
     errors: np.ndarray  # (2, J)
@@ -83,7 +83,7 @@ def workspace(body: Body, physics: Physics, n_edges: int) -> Workspace:
     return Workspace(
         np.empty((n_joints, 3)),
         np.empty(2 + 2 * len(body.roots)),
-        corrections(),
+        corrections(len(body.roots)),
         np.empty((len(physics.bones), 4)),
         np.empty((2, n_joints)),
         np.empty((2, n_joints)),
@@ -218,13 +218,13 @@ def write_limit_terms(
     pose: np.ndarray, person: int, physics: Physics, parts: np.ndarray, work: Workspace
 ) -> None:
     """Write a person's −‖X − X̂‖²/2σ_p², X̂ the projected pose, and number of invalid angles."""
-    bones = work.bones
-    correct_person(pose, physics.trees[person], physics.limits, bones)
+    valid, shifts = work.bones.valid, work.bones.shifts
+    check_person(pose, person, physics.trees[person], physics.limits, True, work.bones)
     square, n_invalid = 0.0, 0
-    for joint in range(len(bones.valid)):
-        n_invalid += not bones.valid[joint]
+    for joint in range(valid.shape[1]):
+        n_invalid += not valid[person, joint]
         for i in range(3):
-            square += bones.shifts[joint, i] ** 2
+            square += shifts[person, joint, i] ** 2
     parts[2 + person] = -0.5 * square / physics.position_noise**2
     parts[2 + len(physics.trees) + person] = n_invalid
 

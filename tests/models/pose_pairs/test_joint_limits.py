@@ -243,6 +243,28 @@ def test_people_are_independent_for_any_order_of_joints(limits):
         np.testing.assert_array_equal(valid[:, bones], expected)
 
 
+def test_a_pose_is_corrected_alike_after_similar_ones(table):
+    """Bones that equal those of the previous pose are not checked again."""
+    rng = np.random.default_rng(0)
+    # On a grid, joints that move together keep their bones exactly.
+    start = np.round(1024 * swings(1)[0]) / 1024
+    poses = []
+    for joint in rng.integers(1, 17, size=600):
+        moved = [j for j in range(17) if joint in (j, *PERSON.ancestors(j))]
+        pose = start.copy()
+        # Every fourth bone has no length.
+        bone = pose[joint] - pose[PERSON.parents[joint]]
+        far = rng.random() < 0.75
+        pose[moved] += rng.integers(-200, 200, size=3) / 1024 if far else -bone
+        poses.append(pose)
+    valid, nearest = table.project(np.array(poses))
+    assert 0.1 < valid.mean() < 0.99
+    for index, pose in enumerate(poses):
+        expected, corrected = table.project(pose)
+        np.testing.assert_array_equal(valid[index], expected)
+        np.testing.assert_array_equal(nearest[index], corrected)
+
+
 def test_degenerate_poses_are_corrected(limits):
     """The poses have coincident joints or hips, a spine along the hips, or are mirrored."""
     poses = np.repeat(swings(1), 5, axis=0)
