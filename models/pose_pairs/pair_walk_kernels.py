@@ -30,6 +30,7 @@ from probmotion.models.pose_pairs.pair_densities import (
 from probmotion.models.pose_pairs.pair_moves import (
     APPROACH,
     SHIFT,
+    STRETCH,
     TURN,
     Body,
     propose,
@@ -40,9 +41,9 @@ __all__ = ["walk"]
 
 _SURROGATE_STEPS = 40
 """Surrogate steps per proposal, for an acceptance rate of about two thirds."""
-_ANNOTATION_PROPOSALS = 4
+_ANNOTATION_PROPOSALS = 2
 """Proposals of another annotation per block of surrogate steps."""
-_VIEW_PROPOSALS = 6
+_VIEW_PROPOSALS = 2
 """View proposals per walk."""
 
 
@@ -206,8 +207,9 @@ def _surrogate_walk(
         else:
             propose(pose, moves[number], sizes[number], body, rng, proposed)
         overwrite(new_parts, parts)
+        if kind in (STRETCH, TURN, SHIFT):
+            new_parts[0] = log_measure(proposed, body)  # Others keep bone lengths and roots.
         # Delayed acceptance: evaluate cheap terms first (Christen and Fox 2005).
-        new_parts[0] = log_measure(proposed, body)
         new = 0.0
         if power > 0:
             new = log_surrogate(proposed, view, annotation, body, views, work)

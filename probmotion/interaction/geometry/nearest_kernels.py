@@ -204,7 +204,7 @@ def rotation(source: np.ndarray, target: np.ndarray) -> tuple[float, float, floa
     return 1.0, 0.0, 0.0
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def _distance(
     projection: Projection,
     k: int,
@@ -252,7 +252,7 @@ def _annotation_sum(difference: np.ndarray, k: int, prepared: Prepared, terms: n
     return _sum(terms, stop - start)
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def projection_sum(
     difference: np.ndarray,
     projection: Projection,
@@ -289,7 +289,7 @@ def _sum(terms: np.ndarray, n_terms: int) -> float:
     return (a + b) + (c + d)
 
 
-@numba.njit(cache=True)
+@numba.njit(**NO_ALLOCATION)
 def _root_mean_square(difference: np.ndarray, seen: np.ndarray, n_visible: int) -> float:
     """Return the RMS distance of the visible joints after removal of the mean difference."""
     if n_visible == 0:

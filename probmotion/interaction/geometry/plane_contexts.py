@@ -34,7 +34,8 @@ def polar_bins(joints: np.ndarray) -> np.ndarray:
     return bins
 
 
-@numba.njit(cache=True)
+# By default, options are those of the caller, which allocates no arrays.
+@numba.njit(cache=True, _nrt=True)
 def context_cost(
     bins: np.ndarray,
     turn: float,
