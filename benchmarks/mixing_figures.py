@@ -33,9 +33,10 @@ ROWS: tuple[tuple[str, str, float, int, int, Mapping[str, Sampler]], ...] = (
     ("salsa_pairs_swd_300s", "salsa-pairs", 600.0, 4, 3, PAIRS),
     ("dance_pairs_swd_6s", "dance-pairs", 12.0, 1, 12, PAIRS),
     ("dance_pairs_swd_30s", "dance-pairs", 60.0, 1, 8, PAIRS),
-    ("dance_pairs_swd_120s", "dance-pairs", 240.0, 4, 3, PAIRS),
+    ("dance_pairs_swd_120s", "dance-pairs", 240.0, 4, 8, PAIRS),
     ("dance_pairs_swd_300s", "dance-pairs", 600.0, 4, 3, PAIRS),
     ("salsa_physical_swd_30s", "salsa-physical", 60.0, 4, 3, PAIRS),
+    ("salsa_physical_swd_120s", "salsa-physical", 240.0, 4, 4, PAIRS),
 )
 """Name, problem, seconds per run, chains, seeds, and samplers."""
 
